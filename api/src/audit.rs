@@ -8,10 +8,9 @@
 //! The **canonical form** is the entry as JSON without the fields `previous_hash` and `hash`: the
 //! names of each object are sorted by their bytes, there is no white space, unknown values are
 //! `null`, and a number with a fraction or an exponent has the fewest digits that parse to the same
-//! value, such as `5e-1`, `2e0` or `1.25e2`. The fields `actor` and `request` are named `who` and
-//! `what` there, as when the first entries were hashed. Entries are numbered without gaps.
-//! Retention removes the oldest entries; the number and hash of the last removed entry are kept in
-//! [`AuditChain`], so the rest stays verifiable.
+//! value, such as `5e-1`, `2e0` or `1.25e2`. Entries are numbered without gaps. Retention removes
+//! the oldest entries; the number and hash of the last removed entry are kept in [`AuditChain`], so
+//! the rest stays verifiable.
 //!
 //! Somebody who can write the database and knows this scheme can compute another valid chain. Only
 //! a number and hash that were recorded elsewhere before reveal it: by `tread audit verify`, in an
@@ -29,9 +28,6 @@ use crate::identity::AuditEntry;
 /// `previous_hash` of the first entry of a log.
 pub const FIRST_PREVIOUS_HASH: &str =
     "0000000000000000000000000000000000000000000000000000000000000000";
-
-/// Fields with other names in the canonical form: their names when the first entries were hashed.
-const HASHED_NAMES: [(&str, &str); 2] = [("actor", "who"), ("request", "what")];
 
 /// Numbers and hashes at both ends of the stored entries, from which the chain is verified.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -65,10 +61,6 @@ pub fn canonical(entry: &AuditEntry) -> String {
     if let Value::Object(fields) = &mut value {
         fields.remove("previous_hash");
         fields.remove("hash");
-        for (present, hashed) in HASHED_NAMES {
-            let field = fields.remove(present).unwrap_or_default();
-            fields.insert(hashed.to_owned(), field);
-        }
     }
     let mut text = String::new();
     write_canonical(&value, &mut text);
@@ -223,9 +215,9 @@ mod tests {
     fn entry(id: u64) -> AuditEntry {
         serde_json::from_value(json!({
             "id": id, "at": "2026-11-22T09:00:00.000001Z", "since": null, "count": 1,
-            "actor": "desk", "token": null, "role": "admin", "address": "192.0.2.1",
+            "who": "desk", "token": null, "role": "admin", "address": "192.0.2.1",
             "method": "POST", "route": "/v1/sites", "path": "/v1/sites", "status": 201,
-            "request_id": "", "request": {"id": "yard", "cell_m": 2.0, "b": [1e300, "ü\n"], "a": -0.5},
+            "request_id": "", "what": {"id": "yard", "cell_m": 2.0, "b": [1e300, "ü\n"], "a": -0.5},
             "previous_hash": null, "hash": null,
         }))
         .unwrap()
@@ -275,10 +267,7 @@ mod tests {
             broken(|entries| entries[2].status = 200),
             Broken::Changed(3)
         );
-        assert_eq!(
-            broken(|entries| entries[2].request = None),
-            Broken::Changed(3)
-        );
+        assert_eq!(broken(|entries| entries[2].what = None), Broken::Changed(3));
         let missing = Broken::Missing { last: 2, next: 4 };
         assert_eq!(broken(|entries| drop(entries.remove(2))), missing);
         assert_eq!(

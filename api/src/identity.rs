@@ -295,8 +295,7 @@ pub struct AuditEntry {
     /// response share one entry.
     pub count: u64,
     /// Name of the token or of the person; `null` for a request without valid credentials.
-    #[serde(alias = "who")]
-    pub actor: Option<String>,
+    pub who: Option<String>,
     /// Identifier of the token; `null` without one.
     pub token: Option<TokenId>,
     /// Person who had signed in at an OpenID provider; absent for a token.
@@ -319,8 +318,7 @@ pub struct AuditEntry {
     /// requests. The server's log contains it too.
     pub request_id: String,
     /// Body of the request without secrets, shortened if it was long; `null` without one.
-    #[serde(alias = "what")]
-    pub request: Option<serde_json::Value>,
+    pub what: Option<serde_json::Value>,
     /// Hash of the previous entry; `null` in entries of versions without a hash chain.
     pub previous_hash: Option<String>,
     /// Hash of this entry, over `previous_hash` and the canonical form of the entry; `null` in

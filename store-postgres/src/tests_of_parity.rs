@@ -581,17 +581,17 @@ async fn records_and_webhooks_are_the_same() {
     with_both("records_and_webhooks_are_the_same", async |both| {
         let entry = |second: i64, status: u16| {
             of::<tread_api::identity::AuditEntry>(json!({"id": 0, "at": at(second), "since": at(-1), "count": 2,
-                "actor": "Ä", "token": id::<String>(1), "role": "viewer", "address": "::1", "method": "PUT",
-                "route": "/v1", "path": "/v1", "status": status, "request_id": "r", "request": {"b": 0.1, "a": [1]},
+                "who": "Ä", "token": id::<String>(1), "role": "viewer", "address": "::1", "method": "PUT",
+                "route": "/v1", "path": "/v1", "status": status, "request_id": "r", "what": {"b": 0.1, "a": [1]},
                 "previous_hash": null, "hash": null}))
         };
         both!(both, audit::append(&[entry(5, 200), entry(3, 403)]));
         both!(both, audit::append(&[entry(4, 500)]));
         both!(both, audit::chain());
-        for (refused, beyond, actor) in [(false, None, None), (true, Some(2), Some("Ä")), (false, None, Some("b"))] {
+        for (refused, beyond, who) in [(false, None, None), (true, Some(2), Some("Ä")), (false, None, Some("b"))] {
             for order in ["newest", "oldest"] {
                 let filter = audit::AuditFilter {
-                    actor: actor.map(str::to_owned),
+                    who: who.map(str::to_owned),
                     refused,
                     order: of(json!(order)),
                     beyond,

@@ -41,7 +41,7 @@ impl TryFrom<Raw> for AuditEntry {
             at: from_us(raw.at_us)?,
             since: raw.since_us.map(from_us).transpose()?,
             count: unsigned("count", raw.count)?,
-            actor: raw.who,
+            who: raw.who,
             token: token.map(|id| parse("token", id)).transpose()?,
             person: person
                 .map(|person| from_json("person", person))
@@ -53,7 +53,7 @@ impl TryFrom<Raw> for AuditEntry {
             path: raw.path,
             status: unsigned("status", raw.status)?,
             request_id: raw.request_id,
-            request: what.map(|what| from_json("body", what)).transpose()?,
+            what: what.map(|what| from_json("body", what)).transpose()?,
             previous_hash: raw.previous_hash,
             hash: raw.hash,
         })
@@ -79,7 +79,7 @@ pub async fn list(
                      AND ($3 = FALSE OR status >= 400)
                    ORDER BY id DESC LIMIT $4"#,
                 beyond,
-                filter.actor,
+                filter.who,
                 filter.refused,
                 i64::from(limit),
             )
@@ -94,7 +94,7 @@ pub async fn list(
                      AND ($3 = FALSE OR status >= 400)
                    ORDER BY id LIMIT $4"#,
                 beyond,
-                filter.actor,
+                filter.who,
                 filter.refused,
                 i64::from(limit),
             )
@@ -183,7 +183,7 @@ async fn insert(db: &mut Connection, entry: &AuditEntry) -> Result<(), EngineErr
     let role = entry.role.map(Role::as_str);
     let person = entry.person.as_ref();
     let person = person.map(|person| to_json("person", person)).transpose()?;
-    let what = entry.request.as_ref().map(|body| to_json("body", body));
+    let what = entry.what.as_ref().map(|what| to_json("body", what));
     let what = what.transpose()?;
     sqlx::query!(
         "INSERT INTO audit (id, at_us, since_us, count, who, token_id, person, role, address, method,
@@ -193,7 +193,7 @@ async fn insert(db: &mut Connection, entry: &AuditEntry) -> Result<(), EngineErr
         at_us,
         since_us,
         count,
-        entry.actor,
+        entry.who,
         token,
         person,
         role,

@@ -7,7 +7,7 @@ use tread_api::identity::AuditOrder;
 #[derive(Debug, Clone, Default)]
 pub struct AuditFilter {
     /// Only those of the token or person of this name.
-    pub actor: Option<String>,
+    pub who: Option<String>,
     /// Only those of refused requests.
     pub refused: bool,
     /// Order of the list.

@@ -164,7 +164,7 @@ pub(crate) struct AuditArguments {
     pub(crate) action: Option<AuditAction>,
     /// Show only requests of the token or person with this name
     #[arg(long)]
-    pub(crate) actor: Option<String>,
+    pub(crate) who: Option<String>,
     /// Show only requests that were refused or failed
     #[arg(long)]
     pub(crate) refused: bool,

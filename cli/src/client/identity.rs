@@ -128,7 +128,7 @@ impl Client {
     /// Lists the newest entries of the audit log, at most `limit`.
     pub(crate) async fn audit(
         &self,
-        actor: Option<&str>,
+        who: Option<&str>,
         refused: bool,
         limit: u32,
     ) -> Result<Page<AuditEntry>, ClientError> {
@@ -136,7 +136,7 @@ impl Client {
             ("limit", limit.to_string()),
             ("refused", refused.to_string()),
         ];
-        query.extend(actor.map(|actor| ("actor", actor.to_owned())));
+        query.extend(who.map(|who| ("who", who.to_owned())));
         self.get_with("/v1/audit", &query).await
     }
 }

@@ -25,8 +25,8 @@ pub(super) async fn run(
 ) -> anyhow::Result<ExitCode> {
     match &arguments.action {
         None => {
-            let actor = arguments.actor.as_deref();
-            let page = client.audit(actor, arguments.refused, arguments.limit);
+            let who = arguments.who.as_deref();
+            let page = client.audit(who, arguments.refused, arguments.limit);
             output.show(&page.await?.items, |entries| audited(entries))?;
         }
         Some(AuditAction::Export {
@@ -64,23 +64,23 @@ pub(super) async fn run(
 
 fn audited(entries: &[AuditEntry]) -> String {
     let mut table = table([
-        "AT", "COUNT", "ACTOR", "ROLE", "FROM", "ROUTE", "STATUS", "REQUEST",
+        "AT", "COUNT", "WHO", "ROLE", "FROM", "REQUEST", "STATUS", "BODY",
     ]);
     for entry in entries {
-        let request = entry
-            .request
+        let what = entry
+            .what
             .as_ref()
             .map(ToString::to_string)
             .unwrap_or_default();
         table.add_row([
             format!("{:.0}", entry.at),
             entry.count.to_string(),
-            or_dash(entry.actor.as_ref()),
+            or_dash(entry.who.as_ref()),
             or_dash(entry.role),
             entry.address.clone(),
             format!("{} {}", entry.method, entry.path),
             entry.status.to_string(),
-            request,
+            what,
         ]);
     }
     render(&table)

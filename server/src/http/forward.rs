@@ -465,7 +465,7 @@ mod tests {
             let url = at(path).unwrap();
             assert_eq!(url.as_str(), format!("https://a.example.org:8420{path}"));
         }
-        let named = at("/v1/audit?actor=O'Brien").unwrap();
+        let named = at("/v1/audit?who=O'Brien").unwrap();
         assert_eq!(named.query_pairs().next().unwrap().1, "O'Brien");
         for path in ["/v1/../metrics", "/a/%2e%2e/b", "*", "/a\\b"] {
             assert!(matches!(at(path), Err(ForwardError::Path)), "{path}");

@@ -64,7 +64,7 @@ fn audit_entry(restoration: &Restoration, backup: &str, changed: Changed) -> Aud
         at: restoration.restored_at,
         since: None,
         count: 1,
-        actor: Some("tread-server restore".to_owned()),
+        who: Some("tread-server restore".to_owned()),
         token: None,
         person: None,
         role: None,
@@ -74,7 +74,7 @@ fn audit_entry(restoration: &Restoration, backup: &str, changed: Changed) -> Aud
         path: backup.to_owned(),
         status: 200,
         request_id: String::new(),
-        request: Some(json!({
+        what: Some(json!({
             "backup_taken_at": restoration.taken_at,
             "backup_version": restoration.version,
             "robots_awaiting_release": changed.robots,

@@ -509,9 +509,9 @@ pub(crate) const PATHS: &[WritePath] = &[
         act: |ground, _number| {
             Box::pin(ground.write(async move |tx| {
                 let entry = of(json!({
-                    "id": 0, "at": now(), "since": null, "count": 1, "actor": "a test", "token": null, "role": null,
+                    "id": 0, "at": now(), "since": null, "count": 1, "who": "a test", "token": null, "role": null,
                     "address": "127.0.0.1", "method": "GET", "route": "/", "path": "/",
-                    "status": 200, "request_id": "1", "request": null,
+                    "status": 200, "request_id": "1", "what": null,
                     "previous_hash": null, "hash": null,
                 }));
                 let entries = [entry];

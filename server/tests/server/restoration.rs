@@ -269,9 +269,7 @@ async fn sessions_and_join_tokens_end_and_numbers_that_were_given_are_not_given_
     assert!(status.is_success(), "{again}");
     assert!(again["revision"].as_u64().unwrap() > 1_000_000, "{again}");
     // The audit log says so, and its chain holds.
-    let (_, audit) = yard
-        .get_value("/v1/audit?actor=tread-server%20restore")
-        .await;
+    let (_, audit) = yard.get_value("/v1/audit?who=tread-server%20restore").await;
     assert_eq!(audit["items"][0]["method"], "RESTORE", "{audit}");
     assert!(audit["items"][0]["hash"].is_string(), "{audit}");
     yard.server.stop().await.unwrap();

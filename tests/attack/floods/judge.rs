@@ -68,12 +68,12 @@ fn missing(changes: &[Change], exported: &str) -> anyhow::Result<Vec<String>> {
     let mut entries = HashSet::new();
     for line in exported.lines() {
         let entry: AuditEntry = serde_json::from_str(line)?;
-        let request = entry.request.unwrap_or_default();
+        let what = entry.what.unwrap_or_default();
         entries.insert(Change {
             method: entry.method,
             path: entry.path,
             status: entry.status,
-            name: request["name"].as_str().map(str::to_owned),
+            name: what["name"].as_str().map(str::to_owned),
         });
     }
     let is_missing = |change: &&Change| !entries.contains(*change);

@@ -46,8 +46,6 @@ const RENAMED: [(&str, &str); 12] = [
     ("sure_s", "known_s"),
     ("theta_sd", "theta_std_dev"),
     ("wanted_at", "requested_at"),
-    ("what", "request"),
-    ("who", "actor"),
 ];
 /// Causes of steps that were renamed since, by their earlier names.
 const RENAMED_CAUSES: [(&str, &str); 2] = [

@@ -116,7 +116,7 @@ struct RequestKind {
     /// The path, for a successful change.
     path: Option<String>,
     /// A hash of the body, for a successful change on a route that concerns rights.
-    request: Option<u64>,
+    what: Option<u64>,
 }
 
 /// Returns whether the bodies of a route concern rights.
@@ -139,15 +139,15 @@ impl RequestKind {
     /// Returns the kind of this request.
     fn of(entry: &AuditEntry) -> Self {
         let is_change = entry.status < 400 && !is_sign_in(&entry.route);
-        let request = (is_change && is_of_rights(&entry.route)).then(|| {
+        let what = (is_change && is_of_rights(&entry.route)).then(|| {
             let mut hasher = DefaultHasher::new();
-            let text = entry.request.as_ref().map(ToString::to_string);
+            let text = entry.what.as_ref().map(ToString::to_string);
             text.hash(&mut hasher);
             hasher.finish()
         });
         Self {
             path: is_change.then(|| entry.path.clone()),
-            request,
+            what,
             ..Self::of_route(entry)
         }
     }
@@ -160,7 +160,7 @@ impl RequestKind {
             route: entry.route.clone(),
             status: entry.status,
             path: None,
-            request: None,
+            what: None,
         }
     }
 }

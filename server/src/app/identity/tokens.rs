@@ -151,7 +151,7 @@ impl App {
             at: now,
             since: None,
             count: 1,
-            actor: Some("init".to_owned()),
+            who: Some("init".to_owned()),
             token: None,
             person: None,
             role: None,
@@ -161,7 +161,7 @@ impl App {
             path: "tread-server init".to_owned(),
             status: 201,
             request_id: String::new(),
-            request: Some(serde_json::json!({"name": created.token.name, "role": "admin"})),
+            what: Some(serde_json::json!({"name": created.token.name, "role": "admin"})),
             previous_hash: None,
             hash: None,
         };

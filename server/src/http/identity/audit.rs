@@ -19,7 +19,7 @@ use crate::http::problem::Problem;
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct AuditQuery {
     /// Only entries of the token or person of this name.
-    actor: Option<String>,
+    who: Option<String>,
     /// Only requests that were refused or failed.
     #[serde(default)]
     #[param(required = false)]
@@ -46,7 +46,7 @@ pub(in crate::http) async fn list(
     let filter = AuditFilter {
         order: query.order,
         beyond: cursor(query.cursor.as_deref())?,
-        actor: query.actor,
+        who: query.who,
         refused: query.refused,
     };
     Ok(Json(app.audit_log(&filter, limit).await?))

@@ -222,7 +222,7 @@ impl Guard {
             at: self.app.clock().now(),
             since: None,
             count: 1,
-            actor: who.map(|who| who.name.clone()),
+            who: who.map(|who| who.name.clone()),
             token: who.and_then(|who| who.subject.token()),
             person: who.and_then(|who| who.person.clone()),
             role: who.and_then(|who| who.role),
@@ -232,7 +232,7 @@ impl Guard {
             path: asked.path,
             status: response.status().as_u16(),
             request_id: asked.request_id,
-            request: said.or(left).filter(|body| !body.is_null()),
+            what: said.or(left).filter(|what| !what.is_null()),
             previous_hash: None,
             hash: None,
         };

@@ -70,9 +70,9 @@ async fn changes_and_refusals_are_written_and_secrets_are_not() {
         .iter()
         .rev()
         .map(|entry| {
-            let actor = entry["actor"].as_str().unwrap_or("-");
+            let who = entry["who"].as_str().unwrap_or("-");
             (
-                actor,
+                who,
                 entry["route"].as_str().unwrap(),
                 entry["status"].as_u64().unwrap(),
             )
@@ -90,7 +90,7 @@ async fn changes_and_refusals_are_written_and_secrets_are_not() {
         ]
     );
     let made = &all[all.len() - 2];
-    assert_eq!(made["request"], json!({"id": "field", "cell_m": 2.0}));
+    assert_eq!(made["what"], json!({"id": "field", "cell_m": 2.0}));
     assert_eq!(
         (&made["address"], &made["role"]),
         (&json!("127.0.0.1"), &json!("admin"))
@@ -100,7 +100,7 @@ async fn changes_and_refusals_are_written_and_secrets_are_not() {
     assert!(!said.contains(&viewer) && !said.contains("guess"), "{said}");
 
     assert_eq!(entries(&yard, "refused=true").await.len(), 3);
-    assert_eq!(entries(&yard, "actor=screen").await.len(), 2);
+    assert_eq!(entries(&yard, "who=screen").await.len(), 2);
     let (_, first) = yard.get_value("/v1/audit?limit=4").await;
     let cursor = first["next_cursor"].as_str().unwrap();
     assert_eq!(
@@ -213,8 +213,8 @@ async fn a_viewer_who_floods_pushes_no_change_of_an_admin_out_of_the_log() {
     for number in 0..CHANGES {
         let name = json!(format!("desk-{number}"));
         let is_it = |entry: &&AuditEntry| {
-            let request = entry.request.as_ref();
-            entry.method == "POST" && request.is_some_and(|body| body["name"] == name)
+            let what = entry.what.as_ref();
+            entry.method == "POST" && what.is_some_and(|what| what["name"] == name)
         };
         let found: Vec<_> = entries.iter().filter(is_it).collect();
         assert_eq!(found.len(), 1, "{name}: {found:?}");

@@ -144,8 +144,8 @@ async fn a_join_token_counts_once_and_whatever_does_not_count_is_answered_alike(
     let named_in_log = |log: &Value, made: &Value, refused: &str| {
         let entries = log["items"].as_array().unwrap();
         entries.iter().any(|entry| {
-            let request = &entry["request"];
-            request["join_token"] == made["join_token"]["id"] && request["refused"] == refused
+            let what = &entry["what"];
+            what["join_token"] == made["join_token"]["id"] && what["refused"] == refused
         })
     };
     let log = eventually("the audit log is written", async || {

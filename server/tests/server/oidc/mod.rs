@@ -159,14 +159,14 @@ async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
 
     // The audit log says who it was and how.
     let entry = eventually("the sign-in is in the audit log", async || {
-        let (_, entries) = yard.get_value("/v1/audit?actor=oidc:anna").await;
+        let (_, entries) = yard.get_value("/v1/audit?who=oidc:anna").await;
         let entry = entries["items"].as_array().unwrap().iter();
         let mut entry = entry.filter(|entry| entry["status"] == 303);
         entry.next().cloned().ok_or(entries.clone())
     })
     .await;
     assert_eq!(entry["person"], session["person"]);
-    assert_eq!(entry["request"]["sign_in"], "oidc");
+    assert_eq!(entry["what"]["sign_in"], "oidc");
     assert_eq!(entry["route"], "/v1/sign-in/oidc/callback");
     assert_eq!(entry["token"], Value::Null);
 

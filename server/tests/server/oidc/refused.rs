@@ -121,11 +121,11 @@ async fn whoever_is_in_no_group_is_refused_with_that_reason_as_a_person_and_as_a
     let entry = eventually("the refusal is in the audit log", async || {
         let (_, entries) = yard.get_value("/v1/audit?refused=true").await;
         let entry = entries["items"].as_array().unwrap().iter();
-        let mut entry = entry.filter(|entry| entry["request"]["refused"] == "no group");
+        let mut entry = entry.filter(|entry| entry["what"]["refused"] == "no group");
         entry.next().cloned().ok_or(entries.clone())
     })
     .await;
-    assert_eq!(entry["request"]["person"]["subject"], "id-eve");
+    assert_eq!(entry["what"]["person"]["subject"], "id-eve");
 
     let begun = browser.begin().await;
     let back = browser.at_provider(begun, "eve").await;

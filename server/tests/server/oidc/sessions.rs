@@ -185,7 +185,7 @@ async fn a_token_that_is_made_with_the_name_of_a_person_is_distinguished_from_th
         ("anna", &of_token["token"], &Value::Null),
     ] {
         let entries = eventually("the refusal is in the audit log", async || {
-            let (_, entries) = yard.get_value(&format!("/v1/audit?actor={name}")).await;
+            let (_, entries) = yard.get_value(&format!("/v1/audit?who={name}")).await;
             let entries = entries["items"].as_array().unwrap().clone();
             let is_there = entries.iter().any(|entry| entry["status"] == 403);
             if is_there { Ok(entries) } else { Err(entries) }

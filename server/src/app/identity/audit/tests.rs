@@ -5,9 +5,9 @@ use super::*;
 fn entry(token: Option<u128>, method: &str, path: &str, status: u16) -> AuditEntry {
     let token = token.map(uuid::Uuid::from_u128);
     serde_json::from_value(json!({
-        "id": 0, "at": "2026-11-22T09:00:00Z", "since": null, "count": 1, "actor": null,
+        "id": 0, "at": "2026-11-22T09:00:00Z", "since": null, "count": 1, "who": null,
         "token": token, "role": null, "address": "192.0.2.1", "method": method, "route": path,
-        "path": path, "status": status, "request_id": "", "request": null,
+        "path": path, "status": status, "request_id": "", "what": null,
         "previous_hash": null, "hash": null,
     }))
     .unwrap()
@@ -36,7 +36,7 @@ fn a_flood_of_one_author_is_counted_and_costs_others_nothing() {
         waiting.add(sign_out.clone(), now);
         if ms % 1_000 == 0 {
             let mut change = entry(Some(1), "POST", "/v1/tokens", 201);
-            change.request = Some(json!({"name": format!("desk-{changes}")}));
+            change.what = Some(json!({"name": format!("desk-{changes}")}));
             assert_ne!(waiting.add(change, now), EntryOutcome::Dropped);
             changes += 1;
         }
@@ -53,7 +53,7 @@ fn a_flood_of_one_author_is_counted_and_costs_others_nothing() {
     assert!(rows < 630, "{rows} entries of one author");
     for number in 0..changes {
         let name = json!({"name": format!("desk-{number}")});
-        let is_it = |entry: &&AuditEntry| entry.request.as_ref() == Some(&name);
+        let is_it = |entry: &&AuditEntry| entry.what.as_ref() == Some(&name);
         assert_eq!(log.iter().filter(is_it).count(), 1, "{name}");
     }
 }
@@ -112,7 +112,7 @@ fn what_is_not_asked_again_is_forgotten() {
 #[test]
 fn a_line_of_the_log_is_printable_ascii() {
     let mut odd = entry(None, "GET", "/v1/\u{1b}[2J\u{202e}\n😀", 404);
-    odd.actor = Some("\u{9b}".to_owned());
+    odd.who = Some("\u{9b}".to_owned());
     let line = ascii_json(&odd);
     assert!(
         line.chars().all(|letter| (' '..='~').contains(&letter)),
