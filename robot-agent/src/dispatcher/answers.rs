@@ -43,7 +43,7 @@ pub(crate) async fn clear(
             return Err(not_ready("the control loop stands still"));
         }
         if !snapshot.stands {
-            let detail = "the robot does not stand";
+            let detail = "the robot is not at standstill";
             return Err(CommandRefusal::new(CommandRefusalCode::Moving, detail));
         }
     }

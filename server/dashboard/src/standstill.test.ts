@@ -10,7 +10,7 @@ const AT = '2026-11-22T06:00:00Z';
 
 test('a robot that is to stand and moves is said so, whatever its mode', () => {
   for (const mode of ['stopped', 'idle', 'fault', 'tracking'] as const) {
-    expect(doing(live(mode, 'standstill_not_reached'))).toEqual({ text: 'DOES NOT STAND', isBad: true });
+    expect(doing(live(mode, 'standstill_not_reached'))).toEqual({ text: 'STILL MOVING', isBad: true });
     expect(doing(live(mode, 'unexpected_motion')).isBad).toBe(true);
   }
   expect(doing(live('stopped', 'stopping'))).toEqual({ text: 'stopping', isBad: false });
@@ -20,7 +20,7 @@ test('a robot that is to stand and moves is said so, whatever its mode', () => {
   expect(doing(null).isBad).toBe(false);
 });
 
-test('a stop is red until it is confirmed, and again where its robot does not stand', () => {
+test('a stop is red until it is confirmed, and again where its robot is still moving', () => {
   expect(stopState(stop(null), live('stopped', 'standstill'))).toBe('unconfirmed');
   expect(stopState(stop(AT), live('stopped', 'stopping'))).toBe('stopping');
   expect(stopState(stop(AT), live('stopped', 'standstill'))).toBe('standstill');

@@ -180,7 +180,7 @@ fn mode_and_standstill(live: &RobotLive) -> String {
     let mode = mode_name(live.mode);
     let standstill = live.safety.standstill.map(|standstill| standstill.state);
     match standstill {
-        Some(StandstillState::StandstillNotReached) => "DOES NOT STAND".to_owned(),
+        Some(StandstillState::StandstillNotReached) => "STILL MOVING".to_owned(),
         Some(StandstillState::UnexpectedMotion) => "MOVES".to_owned(),
         Some(StandstillState::Stopping) if live.mode == RobotMode::Stopped => "stopping".to_owned(),
         Some(StandstillState::Stopping | StandstillState::Standstill | StandstillState::Other)

@@ -76,7 +76,7 @@ interface Seen {
   length: number;
   width: number;
   colour: string;
-  /** It is in fault, does not stand though it is to, or its stop is not confirmed. */
+  /** It is in fault, moves though it is commanded to rest, or its stop is not confirmed. */
   isInTrouble: boolean;
   /** Whose label comes first where there is little room. */
   rank: number;

@@ -70,7 +70,7 @@ export const fleet = {
     lost: 'no answer from the server',
     lostSince: (time: string) =>
       `The server has not answered since ${time}. What is shown is old and stays; connecting again …`,
-    runs: (robots: string, more: number) => `DOES NOT STAND: ${robots}${more > 0 ? ` and ${more} more` : ''}`,
+    runs: (robots: string, more: number) => `STILL MOVING: ${robots}${more > 0 ? ` and ${more} more` : ''}`,
     noSite: 'There is no site yet: an admin makes one with `tread sites create`.',
     panel: 'Fleet',
   },
@@ -90,7 +90,7 @@ export const fleet = {
     refused: (robot: string, why: string) => `${robot}: not stopped. ${why}`,
     /** How a stop in force goes on, and who gave it. */
     states: {
-      runs: (robot: string, by: string) => `${robot}: stopped by ${by}, but it DOES NOT STAND. Use the switch on the robot.`,
+      runs: (robot: string, by: string) => `${robot}: stopped by ${by}, but it is STILL MOVING. Use the switch on the robot.`,
       moves: (robot: string, by: string) =>
         `${robot}: stopped by ${by}, but it MOVES again: it is pushed, rolls, or is driven.`,
       unconfirmed: (robot: string, by: string) =>

@@ -124,7 +124,7 @@ export const right: Record<Right, string> = {
 export const standstill: Record<StandstillState, string> = {
   stopping: 'stopping',
   standstill: 'stopped, stands still',
-  standstill_not_reached: 'DOES NOT STAND',
+  standstill_not_reached: 'STILL MOVING',
   unexpected_motion: 'MOVES WHILE STOPPED',
   other: 'stopped',
 };
@@ -152,7 +152,7 @@ export const alertTitles = {
   'revoked-robot': 'Revoked robot reports',
   'retired-authority': 'Certificate of a retired authority',
   'unknown-certificate': 'Unknown certificate',
-  'standstill-not-reached': 'Robot does not stand',
+  'standstill-not-reached': 'Robot is still moving',
   'moves-while-stopped': 'Robot moves while it is stopped',
   stopped: 'Robot is stopped',
   'dug-in': 'Robot is dug in',
@@ -199,7 +199,7 @@ export const alertSentences: Readonly<Record<AlertKind, (robot: string) => strin
   'revoked-robot': (robot) => `${robot} is revoked and tries to connect.`,
   'retired-authority': (robot) => `${robot} has a certificate of a retired authority and has to join again.`,
   'unknown-certificate': (robot) => `A certificate of ${robot} is not known to the server. The robot has to join again.`,
-  'standstill-not-reached': (robot) => `${robot} is commanded to rest, but it does not stand.`,
+  'standstill-not-reached': (robot) => `${robot} is commanded to rest, but it is still moving.`,
   'moves-while-stopped': (robot) => `${robot} is commanded to rest and stood, but it moves again.`,
   stopped: (robot) => `A stop of ${robot} is in force.`,
   'dug-in': (robot) => `The wheels of ${robot} turn, but the robot does not move.`,
