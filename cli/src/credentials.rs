@@ -138,9 +138,9 @@ impl Store {
     /// Deletes the token of a server; with `only`, only if it equals that token.
     pub(crate) fn remove(&self, address: &str, only: Option<&str>) -> anyhow::Result<()> {
         self.change(|kept| {
-            let kept_one = kept.get(address);
-            let goes = kept_one.is_some_and(|kept| only.is_none_or(|only| only == kept));
-            goes && kept.remove(address).is_some()
+            let stored = kept.get(address);
+            let is_removed = stored.is_some_and(|kept| only.is_none_or(|only| only == kept));
+            is_removed && kept.remove(address).is_some()
         })
     }
 

@@ -237,12 +237,12 @@ pub(crate) async fn log_losses(
     base: Option<Arc<Counts>>,
     stop: CancellationToken,
 ) {
-    let (mut drop_monitor, mut said) = (DropMonitor::default(), None);
+    let (mut drop_monitor, mut logged_drops) = (DropMonitor::default(), None);
     let (mut segments, mut blocks) = (0, 0);
     let mut recent_notices = [RecentNotices::default(); Notice::ALL.len()];
     let mut noticed = [const { None }; Notice::ALL.len()];
-    let (mut foreign, mut foreign_said) = (ForeignCommands::default(), None);
-    let mut missing_said = None;
+    let (mut foreign, mut logged_foreign) = (ForeignCommands::default(), None);
+    let mut logged_missing = None;
     loop {
         tokio::select! {
             () = tokio::time::sleep(LOSSES_EVERY) => {}
@@ -250,10 +250,10 @@ pub(crate) async fn log_losses(
         }
         let dropped = base.as_deref().and_then(|base| drop_monitor.check(base));
         // The count in it grows as long as there is something new.
-        if let Some((_, text)) = dropped.as_ref().filter(|_| dropped != said) {
+        if let Some((_, text)) = dropped.as_ref().filter(|_| dropped != logged_drops) {
             warn!("{text}");
         }
-        said = dropped;
+        logged_drops = dropped;
         if let Some(base) = base.as_deref() {
             for notice in Notice::ALL {
                 let text = recent_notices[notice as usize].check(base, notice);
@@ -263,15 +263,15 @@ pub(crate) async fn log_losses(
                 }
             }
             let text = foreign.check(base);
-            if let Some(text) = text.as_ref().filter(|_| text != foreign_said) {
+            if let Some(text) = text.as_ref().filter(|_| text != logged_foreign) {
                 warn!("{text}");
             }
-            foreign_said = text;
+            logged_foreign = text;
             let text = base.topics_without_messages(&Source::CONTINUOUS);
-            if let Some(text) = text.as_ref().filter(|_| text != missing_said) {
+            if let Some(text) = text.as_ref().filter(|_| text != logged_missing) {
                 warn!("{text}: does a node publish it under this name? (`tread-agent doctor`)");
             }
-            missing_said = text;
+            logged_missing = text;
         }
         let lost = shared.lost_segments.load(Ordering::Relaxed);
         if lost > segments {

@@ -81,14 +81,14 @@ mod tests {
 
     #[test]
     fn a_server_that_listens_everywhere_is_asked_on_the_loopback() {
-        for (listens, asked) in [
+        for (listens, expected) in [
             ("0.0.0.0:8420", "127.0.0.1:8420"),
             ("[::]:8420", "[::1]:8420"),
             ("192.0.2.7:80", "192.0.2.7:80"),
         ] {
             assert_eq!(
                 reachable(listens.parse().unwrap()),
-                asked.parse().unwrap(),
+                expected.parse().unwrap(),
                 "{listens}"
             );
         }

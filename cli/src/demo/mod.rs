@@ -48,7 +48,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     };
     let robots = choose_robots(&scenario, arguments.robots)?;
     let folder = DataFolder::new(arguments.data_dir.clone())?;
-    let tell = |text: &str| {
+    let print_step = |text: &str| {
         if !arguments.json {
             print_note(text);
         }
@@ -56,7 +56,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
 
     // Before anything starts that it must stop.
     let mut signals = ShutdownSignals::listen()?;
-    tell("starting server, database and router …");
+    print_step("starting server, database and router …");
     let mut processes = Processes::start_server(folder.path(), arguments.port, &scenario.site)?;
     let token = credentials::read_token(&processes.token_file())?;
     let client = Client::new(&processes.api_address(), Some(&token), TrustAnchor::System)?;
@@ -74,12 +74,12 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
         None => None,
         Some(Err(error)) => Some(Err(error)),
         Some(Ok((terrains, missions))) => {
-            tell(&welcome(&client, &processes, folder.path(), missions.len()));
+            print_step(&welcome(&client, &processes, folder.path(), missions.len()));
             let watch = Watch::new(&demo, &terrains, missions, &arguments);
             Some(watch.watch_until_end(&mut processes, &mut signals).await)
         }
     };
-    tell("stopping …");
+    print_step("stopping …");
     processes.stop().await;
     let Some(Ended {
         report,
@@ -103,10 +103,10 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
 
 fn choose_robots(scenario: &Scenario, count: u32) -> anyhow::Result<Vec<ScenarioRobot>> {
     let count = usize::try_from(count)?;
-    let there = scenario.robots.len();
+    let available = scenario.robots.len();
     ensure!(
-        count <= there,
-        "the scenario has {there} robots, not {count}: ask for fewer with --robots, or write \
+        count <= available,
+        "the scenario has {available} robots, not {count}: ask for fewer with --robots, or write \
          more into a scenario of your own and give it with --scenario"
     );
     Ok(scenario.robots.iter().take(count).cloned().collect())

@@ -197,13 +197,13 @@ async fn stop_all(parts: &mut [Part]) {
     }
 }
 
-/// Returns the loopback address with the first free port from `wanted` on.
-fn free_address(wanted: u16) -> anyhow::Result<SocketAddr> {
-    let last = wanted.saturating_add(PORTS_TRIED);
-    for port in wanted..=last {
+/// Returns the loopback address with the first free port from `first` on.
+fn free_address(first: u16) -> anyhow::Result<SocketAddr> {
+    let last = first.saturating_add(PORTS_TRIED);
+    for port in first..=last {
         if let Ok(listener) = TcpListener::bind((Ipv4Addr::LOCALHOST, port)) {
             return listener.local_addr().context("a bound port has an address");
         }
     }
-    bail!("no port from {wanted} to {last} is free on the loopback: choose another with --port")
+    bail!("no port from {first} to {last} is free on the loopback: choose another with --port")
 }

@@ -90,7 +90,7 @@ const BLOCKS_MIN: u64 = 5;
 /// Maximum plausible friction coefficient of one side; a sample with more torque is dropped.
 const MU_MAX: f64 = 10.0;
 /// θ in the weights of rows before the first estimate.
-const THETA_FIRST: f64 = 0.2;
+const THETA_INITIAL: f64 = 0.2;
 /// Range of plausible θ; an estimate outside it is not a measurement.
 const THETA_RANGE: std::ops::RangeInclusive<f64> = 5.0e-3..=10.0;
 /// Upper bound of θ before the first measurement.
@@ -187,7 +187,7 @@ impl Estimator {
             bound: ThetaBound {
                 theta: None,
                 slip_max: f64::INFINITY,
-                theta_weights: THETA_FIRST,
+                theta_weights: THETA_INITIAL,
                 theta_most: THETA_MOST_FIRST,
             },
             estimate: Estimate::default(),
@@ -432,7 +432,7 @@ impl Estimator {
                 .map_or(f64::INFINITY, |found| self.slip_max(&found, &sums)),
             theta_weights: solution
                 .filter(|found| found.variance > 0.0 && found.variance.sqrt() < found.theta)
-                .map_or(THETA_FIRST, |found| {
+                .map_or(THETA_INITIAL, |found| {
                     found.theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end())
                 }),
             // A measured θ may exceed the bound assumed before.

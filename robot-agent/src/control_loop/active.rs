@@ -33,7 +33,7 @@ const HELD_STANDING: f64 = 0.04;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Step {
     /// Wheel speeds of the tracking law; zero while the robot is stopped on hold.
-    pub(super) wanted: WheelSpeeds,
+    pub(super) wheel_speeds: WheelSpeeds,
     /// Reason of the mission's end, if it ended in this tick.
     pub(super) end: Option<EndReason>,
     /// Begin or end of a pause in this tick.
@@ -292,7 +292,7 @@ impl Active {
         if self.is_standing_on_hold() && is_on_the_way {
             self.tracked = None;
             return Step {
-                wanted: WheelSpeeds::default(),
+                wheel_speeds: WheelSpeeds::default(),
                 end: None,
                 pause_change,
                 theta_loop: None,
@@ -315,7 +315,7 @@ impl Active {
             | FollowerStatus::Stopping => None,
         };
         Step {
-            wanted: output.wheel_speeds,
+            wheel_speeds: output.wheel_speeds,
             end,
             pause_change,
             theta_loop: Some(output.theta_loop),

@@ -232,8 +232,8 @@ impl App {
                 ..unnumbered(&event, Some(Topic::Missions), about)
             }
         });
-        let wanted = |step: &Sent| filter.matches(step.topic, step.about.as_ref());
-        Ok(missed.filter(wanted).map(Arc::new).collect())
+        let matches = |step: &Sent| filter.matches(step.topic, step.about.as_ref());
+        Ok(missed.filter(matches).map(Arc::new).collect())
     }
 
     /// Returns the first name in a filter that is not known, with its query parameter.

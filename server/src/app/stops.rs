@@ -158,10 +158,10 @@ impl App {
         })
     }
 
-    async fn stop_all(&self, keys: Vec<RobotKey>, said: StopReason) -> Vec<Stop> {
+    async fn stop_all(&self, keys: Vec<RobotKey>, reason: StopReason) -> Vec<Stop> {
         let wanted_at = self.clock().now();
-        let by = text_or(said.by, SOMEBODY);
-        let reason = text_or(said.reason, "no reason was given");
+        let by = text_or(reason.by, SOMEBODY);
+        let reason = text_or(reason.reason, "no reason was given");
         let stop = |(site, robot): RobotKey| Stop {
             id: self.clock().new_id::<StopId>(),
             site,

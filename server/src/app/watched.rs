@@ -49,7 +49,7 @@ pub const REMEMBERED_MAX: usize = 4_096;
 struct Run {
     boot: BootId,
     due: Duration,
-    is_asked: bool,
+    is_pending: bool,
     /// Whether it has answered a request.
     has_answered: bool,
     /// Number of requests without an answer since the last answer.
@@ -139,13 +139,13 @@ impl Watched {
                 robot.run = Some(Run {
                     boot,
                     due: now,
-                    is_asked: false,
+                    is_pending: false,
                     has_answered: false,
                     unanswered: 0,
                 });
             }
             if let Some(run) = robot.run.as_mut()
-                && !run.is_asked
+                && !run.is_pending
                 && run.due <= now
             {
                 due.push((run.due, key.clone(), run));
@@ -153,22 +153,22 @@ impl Watched {
         }
         due.sort_by_key(|(since, ..)| *since);
         let has_more = due.len() > room;
-        let asked = due.into_iter().take(room).map(|(_, key, run)| {
-            run.is_asked = true;
+        let requests = due.into_iter().take(room).map(|(_, key, run)| {
+            run.is_pending = true;
             (key, run.boot)
         });
-        (asked.collect(), has_more)
+        (requests.collect(), has_more)
     }
 
     /// Records what came of a request.
-    fn asked(&self, (key, boot): &(RobotKey, BootId), outcome: Outcome, now: Duration) {
+    fn record_outcome(&self, (key, boot): &(RobotKey, BootId), outcome: Outcome, now: Duration) {
         let mut robots = self.lock();
         let run = robots.get_mut(key).and_then(|robot| robot.run.as_mut());
         // An answer of an earlier run says nothing about the present one.
         let Some(run) = run.filter(|run| run.boot == *boot) else {
             return;
         };
-        run.is_asked = false;
+        run.is_pending = false;
         let rests = match outcome {
             Outcome::Done => {
                 run.has_answered = true;
@@ -196,7 +196,7 @@ impl Run {
         } else {
             self.due
         };
-        !self.is_asked && forgotten_at <= now
+        !self.is_pending && forgotten_at <= now
     }
 }
 
@@ -227,8 +227,8 @@ impl App {
         self.watched().count()
     }
 
-    async fn ask_state_rate(&self, asked: (RobotKey, BootId)) {
-        let (key, boot) = &asked;
+    async fn ask_state_rate(&self, run: (RobotKey, BootId)) {
+        let (key, boot) = &run;
         let command = StateRate {
             rate_hz: WATCHED_STATE_RATE_HZ,
             for_ms: u64::try_from(ASK_FOR.as_millis()).unwrap_or(u64::MAX),
@@ -246,23 +246,23 @@ impl App {
             Err(Undelivered::Unreachable | Undelivered::NoAnswer) => Outcome::NoAnswer,
         };
         self.watched()
-            .asked(&asked, outcome, self.clock().elapsed());
+            .record_outcome(&run, outcome, self.clock().elapsed());
     }
 }
 
 /// Asks the agents of watched robots until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     let watched = app.watched().clone();
-    let mut asking = FuturesUnordered::new();
+    let mut requests = FuturesUnordered::new();
     let mut looks = tokio::time::interval(LOOK_PERIOD);
     looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
         let has_more = {
-            let room = ASKED_AT_ONCE_MAX.saturating_sub(asking.len());
+            let room = ASKED_AT_ONCE_MAX.saturating_sub(requests.len());
             let now = app.clock().elapsed();
             let online = |key: &RobotKey| app.presences().online_run(key, now);
             let (due, has_more) = watched.due(online, now, room);
-            asking.extend(due.into_iter().map(|asked| app.ask_state_rate(asked)));
+            requests.extend(due.into_iter().map(|run| app.ask_state_rate(run)));
             has_more
         };
         loop {
@@ -271,7 +271,7 @@ pub async fn run(app: App, stop: CancellationToken) {
                 () = stop.cancelled() => return,
                 _ = looks.tick() => break,
                 () = watched.begun.notified() => break,
-                Some(()) = asking.next(), if !asking.is_empty() => {
+                Some(()) = requests.next(), if !requests.is_empty() => {
                     if has_more {
                         break;
                     }

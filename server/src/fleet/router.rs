@@ -135,7 +135,7 @@ async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
 
 /// Queries the router over a connection of its own; returns whether it answered. Blocks its thread.
 fn probe(router: &Router, credentials: Option<&RouterCredentials>) -> bool {
-    let asked = || -> zenoh::Result<bool> {
+    let query = || -> zenoh::Result<bool> {
         let config = client_config(router.address, credentials, PROBE_TIMEOUT.as_millis())?;
         let session = zenoh::open(config).wait()?;
         let replies = session.get(PROBE_KEY).timeout(PROBE_TIMEOUT).wait()?;
@@ -143,7 +143,7 @@ fn probe(router: &Router, credentials: Option<&RouterCredentials>) -> bool {
         session.close().wait()?;
         Ok(answered)
     };
-    asked().unwrap_or(false)
+    query().unwrap_or(false)
 }
 
 #[cfg(test)]

@@ -93,20 +93,20 @@ impl File {
         } else {
             Body::from(self.plain).into_response()
         };
-        let said = response.headers_mut();
-        said.insert(header::CONTENT_TYPE, self.media_type.clone());
-        said.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
-        said.insert(header::VARY, HeaderValue::from_static("accept-encoding"));
-        said.insert(
+        let headers = response.headers_mut();
+        headers.insert(header::CONTENT_TYPE, self.media_type.clone());
+        headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
+        headers.insert(header::VARY, HeaderValue::from_static("accept-encoding"));
+        headers.insert(
             header::CONTENT_SECURITY_POLICY,
             HeaderValue::from_static(POLICY),
         );
         if zips && !is_known {
             let encoding = HeaderValue::from_static("gzip");
-            said.insert(header::CONTENT_ENCODING, encoding);
+            headers.insert(header::CONTENT_ENCODING, encoding);
         }
         if let Ok(tag) = HeaderValue::try_from(tag) {
-            said.insert(header::ETAG, tag);
+            headers.insert(header::ETAG, tag);
         }
         response
     }

@@ -129,15 +129,16 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
         )?,
         None => AuthorityOutcome::None,
     };
-    let aside = replace(&database, restoring, now).await?;
+    let replaced = replace(&database, restoring, now).await?;
     file_owner::chown_database(&database)?;
-    if let AuthorityOutcome::Restored(folder, aside) = &authority {
-        for folder in aside.iter().chain([folder]) {
+    if let AuthorityOutcome::Restored(folder, replaced) = &authority {
+        for folder in replaced.iter().chain([folder]) {
             file_owner::chown_to_parents_owner(folder)?;
         }
     }
     let mut out = io::stdout().lock();
-    print_outcome(&mut out, (&database, aside), &restoration, &review).context("cannot print")?;
+    print_outcome(&mut out, (&database, replaced), &restoration, &review)
+        .context("cannot print")?;
     print_authority_outcome(&mut out, &authority, &manifest).context("cannot print")?;
     Ok(())
 }
@@ -301,22 +302,22 @@ fn restore_authority(
     if is_there && !replace {
         return Ok(AuthorityOutcome::Kept(folder.to_owned()));
     }
-    let mut aside = None;
+    let mut replaced = None;
     if folder.exists() {
         let to = unused_name(folder, now);
         fs::rename(folder, &to).map_err(|cause| AuthorityError::Unwritable {
             path: folder.to_owned(),
             cause,
         })?;
-        aside = Some(to);
+        replaced = Some(to);
     }
     copies::write_files(folder, files)?;
-    Ok(AuthorityOutcome::Restored(folder.to_owned(), aside))
+    Ok(AuthorityOutcome::Restored(folder.to_owned(), replaced))
 }
 
 fn print_outcome(
     out: &mut impl Write,
-    (database, aside): (&Path, Option<PathBuf>),
+    (database, replaced): (&Path, Option<PathBuf>),
     restoration: &Restoration,
     review: &Review,
 ) -> io::Result<()> {
@@ -328,8 +329,8 @@ fn print_outcome(
         "`{}` is restored from a backup of {taken_at:.0} by tread-server {version}",
         database.display()
     )?;
-    if let Some(aside) = aside {
-        writeln!(out, "the old database is `{}`", aside.display())?;
+    if let Some(replaced) = replaced {
+        writeln!(out, "the old database is `{}`", replaced.display())?;
     }
     review.write(out)
 }
@@ -352,14 +353,14 @@ fn print_authority_outcome(
              of the backup",
             folder.display()
         ),
-        AuthorityOutcome::Restored(folder, aside) => {
+        AuthorityOutcome::Restored(folder, replaced) => {
             writeln!(
                 out,
                 "the fleet's authority is restored to `{}`",
                 folder.display()
             )?;
-            match aside {
-                Some(aside) => writeln!(out, "the old one is in `{}`", aside.display()),
+            match replaced {
+                Some(replaced) => writeln!(out, "the old one is in `{}`", replaced.display()),
                 None => Ok(()),
             }
         }

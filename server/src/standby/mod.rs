@@ -44,14 +44,14 @@ pub(crate) struct AcquiredLock {
 /// # Errors
 /// Another server uses it, or it cannot be locked.
 pub(crate) async fn acquire_lock(
-    asked: impl Future<Output = ()>,
+    stop_requested: impl Future<Output = ()>,
     config: &Config,
     clock: &Clock,
 ) -> Result<Option<AcquiredLock>, LockError> {
     if !config.standby {
         let lock = tokio::select! {
             lock = DatabaseLock::take(&config.database) => lock?,
-            () = asked => return Ok(None),
+            () = stop_requested => return Ok(None),
         };
         return Ok(Some(AcquiredLock {
             lock,
@@ -70,7 +70,7 @@ pub(crate) async fn acquire_lock(
     };
     let lock = tokio::select! {
         lock = DatabaseLock::wait(&config.database, SILENCE_MAX, waiting) => Some(lock?),
-        () = asked => None,
+        () = stop_requested => None,
     };
     let Some(lock) = lock else {
         notify(&[NotifyState::Stopping]);

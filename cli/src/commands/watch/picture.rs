@@ -68,7 +68,14 @@ pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
         Constraint::Length(rows(known.robots().count(), most.max(3) - 2))
     };
     let below = rows(missions.len(), MISSION_ROWS).min(MISSION_ROWS_LEAST);
-    let [heading, robots_area, missions_area, alerts_area, said, keys] = Layout::vertical([
+    let [
+        heading,
+        robots_area,
+        missions_area,
+        alerts_area,
+        result,
+        keys,
+    ] = Layout::vertical([
         Constraint::Length(2),
         above,
         Constraint::Min(below),
@@ -90,8 +97,8 @@ pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
     if alert_rows > 0 {
         draw_alerts(frame, alerts_area, picture);
     }
-    let text = shown.said.as_deref().unwrap_or_default();
-    frame.render_widget(Paragraph::new(text).style(bold(Color::Yellow)), said);
+    let text = shown.result.as_deref().unwrap_or_default();
+    frame.render_widget(Paragraph::new(text).style(bold(Color::Yellow)), result);
     let dim = Style::new().add_modifier(Modifier::DIM);
     frame.render_widget(Paragraph::new(KEYS).style(dim), keys);
 }

@@ -220,8 +220,8 @@ impl Hub {
         }
         let mut slow = Vec::new();
         for (&id, client) in &state.clients {
-            let wanted = client.filter.matches(sent.topic, sent.about.as_ref());
-            if wanted && !client.take(&sent) {
+            let is_wanted = client.filter.matches(sent.topic, sent.about.as_ref());
+            if is_wanted && !client.take(&sent) {
                 slow.push(id);
             }
         }

@@ -34,11 +34,11 @@ impl App {
     pub async fn visits_worth_most(
         &self,
         site: &SiteId,
-        asked: &ReadingParameters,
+        parameters: &ReadingParameters,
         area: Area,
         limit: u32,
     ) -> Result<MapPage<VisitSuggestion>, AppError> {
-        let reading = Reading::new(self, asked)?;
+        let reading = Reading::new(self, parameters)?;
         let view = self.site_view(site).await?;
         let row = view.row.clone();
         let grid = view.row.site.grid;

@@ -40,11 +40,11 @@ impl App {
         let view = self.site_view(site).await?;
         let found = self.robot_of(view.row.pk, robot).await?;
         let Some(found) = found else { return Ok(None) };
-        let asked = ReadingParameters {
+        let parameters = ReadingParameters {
             configuration: Some(found.configuration),
             ..ReadingParameters::default()
         };
-        let reading = Reading::new(self, &asked)?;
+        let reading = Reading::new(self, &parameters)?;
         let points = corners(trajectory);
         // A path that is too long to be read gets no prior.
         let Ok(cut) = checked_length(&points).and_then(|_| cut(&points, &view.row.site.grid))

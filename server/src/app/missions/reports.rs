@@ -124,11 +124,11 @@ fn content_of(
     mission: &Mission,
     restored_at: Option<Timestamp>,
 ) -> Content {
-    let said = (report.revision, report.plan_hash);
+    let content = (report.revision, report.plan_hash);
     let replacement = mission.replacement.as_ref();
-    if said == (mission.revision, mission.plan_hash) {
+    if content == (mission.revision, mission.plan_hash) {
         Content::Present
-    } else if replacement.is_some_and(|next| said == (next.revision, next.plan_hash)) {
+    } else if replacement.is_some_and(|next| content == (next.revision, next.plan_hash)) {
         Content::Replacement
     } else if report.revision < mission.revision {
         Content::Earlier
@@ -156,8 +156,8 @@ const fn is_end(phase: MissionPhase) -> bool {
 
 /// Returns why a report exceeds the limits that agents observe; `None` if it does not.
 fn impossible(report: &MissionReport) -> Option<String> {
-    let samples = report.quality.as_ref().map_or(0, |said| said.theta.len());
-    let points = report.driven.as_ref().map_or(0, |said| said.points.len());
+    let samples = report.quality.as_ref().map_or(0, |part| part.theta.len());
+    let points = report.driven.as_ref().map_or(0, |part| part.points.len());
     if samples > THETA_SAMPLES_MAX {
         Some(format!(
             "a quality report has at most {THETA_SAMPLES_MAX} samples of theta"
@@ -169,7 +169,7 @@ fn impossible(report: &MissionReport) -> Option<String> {
     } else if report
         .driven
         .as_ref()
-        .is_some_and(|said| !said.has_possible_times())
+        .is_some_and(|part| !part.has_possible_times())
     {
         Some("a driven path has a time for each of its points, in order, or none".to_owned())
     } else {

@@ -108,7 +108,7 @@ impl Presence {
         if self.link(now) == LinkState::Online {
             return None;
         }
-        let speaks = self
+        let is_recent = self
             .spoken_at
             .is_some_and(|at| now.saturating_sub(at) <= ONLINE_TIMEOUT);
         Some(if self.spoken_at.is_none() && self.tokens.is_empty() {
@@ -117,7 +117,7 @@ impl Presence {
             LinkCause::RobotOff
         } else if self.heard_at.is_none() && !self.tokens.is_empty() {
             LinkCause::Joining
-        } else if speaks && !self.tokens.is_empty() {
+        } else if is_recent && !self.tokens.is_empty() {
             LinkCause::LoopStopped
         } else {
             LinkCause::LinkDown
@@ -173,10 +173,10 @@ impl Presence {
 
     /// Returns whether a message came within [`OFFLINE_TIMEOUT`], or a liveliness token is there.
     pub fn is_there(&self, now: Duration) -> bool {
-        let spoke = self
+        let is_recent = self
             .spoken_at
             .is_some_and(|at| now.saturating_sub(at) <= OFFLINE_TIMEOUT);
-        spoke || !self.tokens.is_empty()
+        is_recent || !self.tokens.is_empty()
     }
 
     /// Returns the time since the last state arrived.
@@ -427,8 +427,8 @@ impl Presences {
         if let Some(ahead_us) = monotonic_offset_us(&state, now) {
             presence.monotonic_offsets_us.push(now, ahead_us);
         }
-        let said = presence.state().map(|before| &before.alerts);
-        presence.alerts_changed |= said != Some(&state.alerts);
+        let reported = presence.state().map(|before| &before.alerts);
+        presence.alerts_changed |= reported != Some(&state.alerts);
         presence.progress = state.mission.or(presence.progress);
         presence.state = Some((state, now));
         if has_changed || !was_online {

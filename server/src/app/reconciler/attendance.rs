@@ -70,13 +70,13 @@ struct Now {
 
 impl RobotAttendance {
     /// Returns the transition that follows from a check; the caller applies it once it is stored.
-    fn judge(&mut self, look: ObservedLink, now: Now) -> Option<Turn> {
-        if !look.is_heard {
+    fn judge(&mut self, observed: ObservedLink, now: Now) -> Option<Turn> {
+        if !observed.is_heard {
             self.heard_since = None;
-            if look.has_left {
+            if observed.has_left {
                 return self.is_present.then_some(Turn::Left);
             }
-            let is_over = look.silent >= LOST_AFTER && now.uptime >= START_GRACE;
+            let is_over = observed.silent >= LOST_AFTER && now.uptime >= START_GRACE;
             return (self.is_present && is_over).then_some(Turn::Lost);
         }
         let since = *self.heard_since.get_or_insert(now.elapsed);
@@ -124,13 +124,13 @@ impl Attendance {
         };
         for (key, attending) in app.presences().attending(elapsed) {
             let seen = robots.entry(key.clone()).or_default();
-            let look = ObservedLink {
+            let observed = ObservedLink {
                 is_heard: attending.is_heard,
                 has_left: attending.has_left,
                 // A robot that was never heard has been silent at least since the start.
                 silent: attending.silent_for.unwrap_or(now.uptime),
             };
-            if let Some(turn) = seen.judge(look, now) {
+            if let Some(turn) = seen.judge(observed, now) {
                 write_down(app, &key, turn, attending.cause).await?;
                 seen.apply(turn);
             }

@@ -138,7 +138,7 @@ pub struct Reconciler {
     restricted: HashMap<RobotKey, RestrictedRobot>,
     /// Since when each of those that are to say how their missions ended is heard, and how often it
     /// was asked.
-    asked: HashMap<RobotKey, (Duration, u32)>,
+    outcome_queries: HashMap<RobotKey, (Duration, u32)>,
     /// Time since which the database answers without delay.
     answering_since: Duration,
     /// Time of the first delay of those that have followed each other.
@@ -166,7 +166,7 @@ impl Reconciler {
             conditions: Conditions::default(),
             delays: Delays::default(),
             restricted: HashMap::new(),
-            asked: HashMap::new(),
+            outcome_queries: HashMap::new(),
             answering_since: Duration::ZERO,
             delayed_since: None,
             checks_due: Duration::ZERO,

@@ -45,7 +45,7 @@ impl Fleet {
                 .watched
                 .due(|_| Some(self.boot), self.now, ASKED_AT_ONCE_MAX);
             for asked in due {
-                self.watched.asked(&asked, self.answer, self.now);
+                self.watched.record_outcome(&asked, self.answer, self.now);
                 *self.asked.entry(asked.0).or_default() += 1;
             }
             self.now += STEP;
@@ -138,7 +138,7 @@ fn five_hundred_watched_robots_are_asked_in_turn_and_never_too_many_at_once() {
     let mut under_way = first;
     while !under_way.is_empty() {
         for one in under_way {
-            watched.asked(&one, Outcome::Done, now);
+            watched.record_outcome(&one, Outcome::Done, now);
             *asked.entry(one.0).or_default() += 1;
         }
         under_way = watched.due(online, now, ASKED_AT_ONCE_MAX).0;
@@ -159,7 +159,7 @@ fn what_is_remembered_of_robots_that_nobody_watches_is_bounded() {
         let watch = watched.begin(key(number));
         let (due, _) = watched.due(online, now, ASKED_AT_ONCE_MAX);
         for asked in due {
-            watched.asked(&asked, Outcome::Refused, now);
+            watched.record_outcome(&asked, Outcome::Refused, now);
         }
         drop(watch);
     }

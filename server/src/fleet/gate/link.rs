@@ -269,8 +269,11 @@ impl Link {
         };
         if entry.take_over(init.session_id).await {
             let id = init.session_id;
-            let going = session_gone(&router, id);
-            if tokio::time::timeout(INSIDE_TIMEOUT, going).await.is_err() {
+            let session_end = session_gone(&router, id);
+            if tokio::time::timeout(INSIDE_TIMEOUT, session_end)
+                .await
+                .is_err()
+            {
                 warn!(robot.id = %robot.1, "the former session of robot `{}` did not end", robot.1);
             }
         }
@@ -393,9 +396,9 @@ async fn connect(router: &Router) -> anyhow::Result<TcpStream> {
 /// Waits until a router has closed a session whose link has ended.
 async fn session_gone(router: &Arc<Router>, session_id: u128) {
     loop {
-        let asked = Arc::clone(router);
-        let asking = tokio::task::spawn_blocking(move || asked.has_session(session_id));
-        if !asking.await.unwrap_or(false) {
+        let checked_router = Arc::clone(router);
+        let checking = tokio::task::spawn_blocking(move || checked_router.has_session(session_id));
+        if !checking.await.unwrap_or(false) {
             return;
         }
         tokio::time::sleep(SESSION_GONE_EVERY).await;

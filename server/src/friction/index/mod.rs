@@ -112,8 +112,8 @@ impl<'choice> Choice<'choice> {
         let ratio = |of: ConfigurationId| self.normalisation.and_then(|joined| joined.ratio(of));
         let reference = self.normalisation.map(|joined| joined.reference);
         match (self.configuration, reference) {
-            (Some(asked), _) if asked == found => Some((found, 1.0)),
-            (Some(asked), _) => Some((asked, ratio(found)? / ratio(asked)?)),
+            (Some(chosen), _) if chosen == found => Some((found, 1.0)),
+            (Some(chosen), _) => Some((chosen, ratio(found)? / ratio(chosen)?)),
             (None, Some(reference)) => {
                 Some(ratio(found).map_or((found, 1.0), |ratio| (reference, ratio)))
             }
@@ -315,9 +315,10 @@ impl SiteMap {
         let Some(&robot) = self.names.robots.numbers.get(robot) else {
             return;
         };
-        let goes = |key: &PartKey| key.robot == robot && hours.contains(i64::from(key.epoch_h));
-        self.blocks.remove(goes);
-        self.totals.retain(|key, _sums| !goes(key));
+        let is_withdrawn =
+            |key: &PartKey| key.robot == robot && hours.contains(i64::from(key.epoch_h));
+        self.blocks.remove(is_withdrawn);
+        self.totals.retain(|key, _sums| !is_withdrawn(key));
         self.count_segments();
         // A block may have been absent, or been read after the removal from the database.
         self.changes.record_all();
