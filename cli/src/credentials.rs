@@ -1,9 +1,9 @@
-//! Tokens with which the user has signed in, by server, in a file that only the user can read. Beside
-//! it are a file with the fingerprints by which servers are trusted, and one with the server of the
-//! last login.
+//! Stores the user's tokens, one for each server, in a file that only the user can read. The same
+//! folder has a file with the fingerprints of trusted servers, and one with the server of the last
+//! login.
 //!
-//! A token is taken from the first of: `--token-file`, the environment variable `TREAD_TOKEN`, this
-//! file.
+//! Order of precedence of the sources of a token: `--token-file`, the environment variable
+//! `TREAD_TOKEN`, this file.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};

@@ -58,7 +58,7 @@ impl Feeding {
     }
 }
 
-/// What is read to tell the service manager.
+/// State from which the messages to the service manager are made.
 #[derive(Debug)]
 pub(crate) struct NotifierInputs {
     pub(crate) identity: Identity,

@@ -28,10 +28,11 @@ pub(crate) struct HealthArgs {
     ready: bool,
 }
 
-/// Asks the server on this machine for `/healthz`, or `/readyz`.
+/// Requests `/healthz`, or `/readyz`, from the server on this machine.
 ///
 /// # Errors
-/// The configuration is invalid, nobody answers in time, or the answer is another one.
+/// The configuration is invalid, no answer arrives in time, or the answer is not that of a healthy
+/// server.
 pub(crate) async fn run(args: HealthArgs) -> anyhow::Result<()> {
     let config = Config::load(&ServerArgs {
         config: args.config,

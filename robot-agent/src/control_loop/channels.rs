@@ -47,7 +47,8 @@ pub(crate) enum Hold {
     Replacement,
     /// An external limit holds the robot; the mission goes on when the limit ends.
     Outside,
-    /// The base is silent, or was heard again too recently; the mission goes on by itself.
+    /// The base is silent, or sends again for too short a time; the mission goes on when it has sent for
+    /// long enough.
     Base,
     /// The control loop does not keep its rate; the mission goes on when it does.
     Overrun,

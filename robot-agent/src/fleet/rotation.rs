@@ -1,13 +1,13 @@
 //! Which of several servers the agent connects to next.
 //!
-//! The agent stays with the server that it reached. When that one falls silent, or an attempt to reach
-//! it fails, the next of the list is tried, and after the last one the first. There is no way back to a
-//! preferred server while the present one answers: robots would move twice for each restart.
+//! The agent stays connected to the server that it has reached. If that server falls silent, or an attempt to
+//! reach it fails, the agent tries the next one of the list, and the first after the last. It does not return
+//! to a preferred server while the present one answers: otherwise it would move twice for each restart.
 //!
-//! A server that is gone refuses at once, while one that is frozen or cut off takes seconds of each attempt.
-//! So the others are tried in parallel with an attempt that takes longer, and whichever is reached first is the one, as
-//! for the addresses of a host (RFC 8305). One that fell silent, or took long to fail, is passed over for a
-//! while.
+//! A server that is not running refuses a connection at once; an attempt to reach one that is frozen or cut off
+//! takes seconds. The agent therefore tries the others in parallel with a slow attempt, and uses the server
+//! that it reaches first (as RFC 8305 does for the addresses of a host). It skips a server that fell silent, or
+//! failed slowly, for some time.
 
 use std::time::Duration;
 
@@ -28,7 +28,7 @@ const LONG: Duration = Duration::from_secs(1);
 /// to reach that one.
 const ATTEMPT_DELAY: Duration = Duration::from_millis(200);
 
-/// What was logged about a server since it was reached last.
+/// Problems that were logged about a server since it was reached last.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Logged {
     /// That the robot does not trust its authority.

@@ -65,7 +65,7 @@ pub(crate) struct Replayed {
     pub(crate) differing: u64,
     /// The first differing ticks, at most [`REPORTED_MAX`].
     pub(crate) first_differing: Vec<DifferingTick>,
-    /// What is missing in the record; nothing after it could be replayed.
+    /// Description of a gap in the record; the replay ends at the first gap.
     pub(crate) gap: Option<String>,
     /// Where the record is torn; the replay ends there.
     pub(crate) torn: Option<String>,

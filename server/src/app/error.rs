@@ -53,7 +53,7 @@ pub enum AppError {
         /// How it ended.
         state: MissionState,
     },
-    /// The mission's state does not allow what is asked.
+    /// The mission's state does not permit the requested action.
     #[error("mission `{id}` is {} and cannot be {action} now", state.as_str())]
     MissionState {
         /// The mission.

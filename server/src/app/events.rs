@@ -126,9 +126,10 @@ impl App {
         self.inner.event_shares.take(of, "event clients")
     }
 
-    /// Subscribes a client: what it missed since its last event, or a snapshot, comes first.
+    /// Subscribes a client. It first gets the events since `last`, or a snapshot if these are not
+    /// available.
     ///
-    /// `cut` is cancelled when the client is dropped and does not read its end.
+    /// `cut` is cancelled if the client is dropped and does not read the event that tells it so.
     ///
     /// # Errors
     /// [`AppError::TooMany`] beyond [`CLIENTS_MAX`] clients, or the database failed.

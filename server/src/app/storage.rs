@@ -243,7 +243,7 @@ impl App {
         condition
     }
 
-    /// Examines the whole file, if there is a reason and the last examination is not too recent.
+    /// Examines the whole database if damage is suspected or known and the last examination is old enough.
     async fn examine_database(&self) {
         let reports = failure::count(StorageFailure::Damaged);
         let now = self.clock().elapsed();

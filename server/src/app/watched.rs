@@ -33,18 +33,18 @@ use super::robot_link::Undelivered;
 pub const ASK_FOR: Duration = Duration::from_secs(5);
 /// Interval of the requests to one robot.
 pub const ASK_PERIOD: Duration = Duration::from_millis(1_500);
-/// Number of requests without an answer after which a run that never answered is left alone.
+/// Number of unanswered requests after which a run that never answered gets none for [`REST`].
 pub const TRIES_MAX: u32 = 3;
-/// Time for which a run is left alone that does not answer or refuses.
+/// Time without requests to a run that refused, or that never answered.
 pub const REST: Duration = Duration::from_mins(10);
 /// Maximum number of requests under way.
 pub const ASKED_AT_ONCE_MAX: usize = 32;
 /// Interval of checks for robots that are due.
 const LOOK_PERIOD: Duration = Duration::from_millis(250);
-/// Maximum number of robots that nobody watches any more and whose last answer is remembered.
+/// Maximum number of unwatched robots whose last answer is kept.
 pub const REMEMBERED_MAX: usize = 4_096;
 
-/// What is known of a run of an agent that was asked.
+/// State of the requests to one run of an agent.
 #[derive(Debug, Clone, Copy)]
 struct Run {
     boot: BootId,
@@ -63,7 +63,7 @@ struct Robot {
     run: Option<Run>,
 }
 
-/// What came of a request.
+/// Outcome of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Outcome {
     Done,
@@ -160,7 +160,7 @@ impl Watched {
         (requests.collect(), has_more)
     }
 
-    /// Records what came of a request.
+    /// Records the outcome of a request, and schedules the next one.
     fn record_outcome(&self, (key, boot): &(RobotKey, BootId), outcome: Outcome, now: Duration) {
         let mut robots = self.lock();
         let run = robots.get_mut(key).and_then(|robot| robot.run.as_mut());
@@ -189,7 +189,7 @@ impl Watched {
 }
 
 impl Run {
-    /// Returns whether it would be asked now as if it had never been asked before.
+    /// Returns whether dropping this state would change nothing: a new state would be due now too.
     fn is_as_new(&self, now: Duration) -> bool {
         let forgotten_at = if self.unanswered > 0 {
             self.due.saturating_add(REST)
@@ -200,8 +200,8 @@ impl Run {
     }
 }
 
-/// Forgets robots that nobody watches and of whose runs nothing needs to be remembered; of more than
-/// [`REMEMBERED_MAX`] others, those that are due first.
+/// Drops the state of unwatched robots whose run needs no state. Keeps at most [`REMEMBERED_MAX`]
+/// other unwatched robots, and drops those that are due first.
 fn evict_idle(robots: &mut HashMap<RobotKey, Robot>, now: Duration) {
     robots.retain(|_, robot| {
         robot.watchers > 0 || robot.run.as_ref().is_some_and(|run| !run.is_as_new(now))
@@ -250,7 +250,7 @@ impl App {
     }
 }
 
-/// Asks the agents of watched robots until the stop.
+/// Requests the higher rate from the agents of watched robots until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     let watched = app.watched().clone();
     let mut requests = FuturesUnordered::new();

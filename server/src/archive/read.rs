@@ -1,4 +1,4 @@
-//! Reads a file: only the row groups that may contain what is wanted, and only after their checksums.
+//! Reads the row groups of a file that may contain selected rows, after it has verified their checksums.
 
 use std::ops::Range;
 use std::path::PathBuf;
@@ -77,8 +77,8 @@ impl OpenFile {
         })
     }
 
-    /// Checks that this file follows the last key before it, if there is one. Returns a key that is
-    /// missing between them.
+    /// Checks that no key of this file precedes `preceding`, the last key of the preceding file. Returns
+    /// the last key that is missing between both files; `None` if there is no gap.
     pub(super) fn missing_before(
         &self,
         preceding: Option<i64>,

@@ -95,9 +95,9 @@ async fn answers(watch: &Watch, router: &Arc<Router>) -> bool {
     matches!(looked, Ok(Some(true)))
 }
 
-/// Opens a router in place of one that does not answer. One that still has robots stays open:
-/// behind the gate beside the new one, until they have left it; without a gate, where there is only
-/// one address, as long as it has robots.
+/// Replaces a router that does not answer. A router that still has robots stays open. With a gate, the
+/// new router is opened at once and the old one closes when its robots have left; without a gate,
+/// there is only one address, so the new router is opened when the old one has no robots.
 async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
     let _turn = pool.turn.lock().await;
     let current = pool.current();

@@ -1,7 +1,7 @@
 //! Extractors of bodies, paths and queries, whose rejections are problems.
 //!
-//! `Json` refuses unknown fields: a client that misspells one wants to know. (Payloads of robots
-//! ignore them, so that old and new versions work together; the types are the same.)
+//! `Json` refuses unknown fields, so that a client learns of a misspelt one. (The decoder of robots'
+//! payloads uses the same types but ignores unknown fields, so that versions can differ.)
 
 use std::collections::BTreeMap;
 use std::time::Duration;

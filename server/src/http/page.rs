@@ -25,7 +25,8 @@ pub(in crate::http) const ROOT: &str = "/";
 pub(in crate::http) const FILES: &str = "/page/{file}";
 /// How the paths of what the page loads begin.
 const FILES_PREFIX: &str = "/page/";
-/// What the page may do: load what this server serves, ask this server, and nothing else.
+/// Content security policy of the page: it may load files from this server and send requests to it,
+/// and nothing else.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; \
     connect-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
     frame-ancestors 'none'";

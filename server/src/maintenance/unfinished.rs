@@ -95,11 +95,11 @@ impl Drop for Unfinished {
     }
 }
 
-/// Refuses the name of a new database if there is such a file, or one of SQLite's beside it, which SQLite
-/// would take for the new one's.
+/// Checks that neither the file of a new database exists, nor a log or lock file of SQLite with its name:
+/// SQLite would treat such a file as one of the new database.
 ///
 /// # Errors
-/// There is such a file.
+/// One of these files exists.
 pub(super) fn check_absent(database: &Path) -> anyhow::Result<()> {
     for ending in BESIDE.into_iter().chain([""]) {
         let file = with_ending(database, ending);

@@ -2,14 +2,14 @@
 //! switched off, another node that commands the base too.
 //!
 //! A wheel's speed must lie between the smallest and the largest command of the last [`MEMORY`],
-//! widened by a tolerance, so that a lag within that time is accepted. Slip does not matter: it
-//! moves the robot against its wheels, not the wheels against their command. Nothing is judged
-//! while only zero was commanded, since the robot may be moved by others then.
+//! widened by a tolerance, so that a lag within that time is accepted. Slip has no effect on the
+//! check: it changes the motion of the robot, not that of the wheels. Wheels are not checked while
+//! only zero was commanded, because somebody may push the robot then.
 //!
-//! Two nodes that command one base alternate, so its wheels follow the agent's commands part of the
-//! time. The time for which they do not is therefore summed up, and reduced by [`PARDON`] of the
-//! time for which they do. Wheels with stuck encoders or a drive that is off stand still without
-//! interruption, which is measured by the time since they last did otherwise.
+//! The commands of two nodes for one base alternate, so its wheels follow those of the agent part of
+//! the time. The time of non-compliance is therefore summed, less [`PARDON`] of the time of
+//! compliance. Wheels with stuck encoders, or with a drive that is off, stand still without
+//! interruption; the duration of this standstill is measured separately.
 
 use std::time::Duration;
 

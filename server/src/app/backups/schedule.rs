@@ -1,5 +1,4 @@
-//! Backups that the server makes by itself: when they are due, how many are kept, and what is shown
-//! of them.
+//! Scheduled backups: when they are due, how many are kept, and their reported state.
 
 use std::fs::DirBuilder;
 use std::os::unix::fs::DirBuilderExt as _;

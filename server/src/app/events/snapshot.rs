@@ -81,7 +81,8 @@ struct Scope {
 struct Built {
     scope: Scope,
     at: Duration,
-    /// Gathering of clients: nothing is published while there is no client.
+    /// Value of the hub's counter of first clients. If it differs, there was a time without clients,
+    /// in which no events were published.
     gathering: u64,
     snapshot: Weak<Snapshot>,
 }

@@ -31,7 +31,7 @@ const CELLS_PER_READ: i32 = 2_048;
 /// The content of a requested picture.
 #[derive(Debug, Clone, Default)]
 pub struct PictureRequest {
-    /// Configuration, normalisation and time.
+    /// Configuration, normalisation and time of the reading.
     pub parameters: ReadingParameters,
     /// The area; `None` for everything that was driven on.
     pub area: Option<Area>,

@@ -192,7 +192,7 @@ impl Share {
     }
 }
 
-/// A token or session whose last use is stored.
+/// Identifier of a credential, as key of the time of its last use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum UsedCredential {
     Token(TokenId),

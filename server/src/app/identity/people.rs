@@ -191,7 +191,7 @@ impl People {
         self.provider.issuer()
     }
 
-    /// Returns the groups whose grants are within a scope, and those whose grants are not.
+    /// Returns two lists of groups: those whose grants are within a scope, and all others.
     pub(super) fn groups_by_scope(&self, within: &Scope) -> (Vec<&str>, Vec<&str>) {
         let is_within = |name: &&str| {
             let grant = self

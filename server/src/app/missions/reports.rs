@@ -281,10 +281,10 @@ fn shown_of(reporting: Reporting, report: &MissionReport) -> Option<MissionProgr
         .filter(|_| is_end(report.phase))
 }
 
-/// Returns whether a person resumed a mission after `at`: a pause from before that, reported late,
-/// is then no longer wanted. `at` is the time at which the stop or lease began. It must end before
-/// anybody can resume, so this time tells both orders apart with a margin larger than clock errors;
-/// the time at which the robot stopped does not.
+/// Returns whether a person resumed a mission after `at`, the time at which a stop or lease began. The
+/// pause that it caused, if the robot reports it late, is then obsolete. The begin of the stop or lease
+/// is used because nobody can resume before its end: the order is unambiguous in spite of
+/// clock errors, which is not true for the time at which the robot came to rest.
 pub(in crate::app) async fn was_resumed_since(
     tx: &mut Tx,
     id: MissionId,

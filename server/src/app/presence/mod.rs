@@ -124,7 +124,7 @@ impl Presence {
         })
     }
 
-    /// Returns whether the agent's last state says that it leaves.
+    /// Returns whether the agent announced in its last state that it stops.
     pub fn has_left(&self) -> bool {
         self.state().is_some_and(|state| state.leaving)
     }

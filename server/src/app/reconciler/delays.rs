@@ -22,7 +22,7 @@ use crate::db::missions::OpenMission;
 /// Code of the alert about a mission that is next and does not begin.
 pub(in crate::app) const MISSION_WAITING_ALERT: &str = "mission-waiting";
 
-/// What is remembered of a robot whose next mission has not begun.
+/// State of a robot whose next mission has not begun.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct DelayedRobot {
     /// The mission with the time since which it is the next; `None` until the first check after a

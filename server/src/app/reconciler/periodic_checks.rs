@@ -21,11 +21,11 @@ use crate::db::restorations::RestrictedRobot;
 
 /// Maximum number of missions that expire in one pass.
 const EXPIRE_MAX: u32 = 1_000;
-/// Number of attempts to ask a robot how its missions ended, at most [`super::RETRY_MAX`] apart: an agent
-/// that does not know the question never answers.
+/// Maximum number of outcome queries to a robot, at most [`super::RETRY_MAX`] apart. An agent of an older
+/// release does not know the query and never answers.
 const OUTCOMES_TRIES_MAX: u32 = 6;
-/// Time for which a robot is given to upload its reports before it is asked how its missions ended:
-/// they say more.
+/// Time that a robot has to upload its reports before it gets an outcome query: reports contain more
+/// than the answer to the query.
 const OUTBOX_PATIENCE: Duration = Duration::from_secs(10);
 
 impl Reconciler {
@@ -77,7 +77,7 @@ impl Reconciler {
         Ok(())
     }
 
-    /// Asks robots that are restricted since a restoration how their missions ended.
+    /// Sends outcome queries to the robots that await their release after a restoration.
     fn query_restricted_robots(&mut self) {
         let restricted: Vec<RestrictedRobot> = self.restricted.values().cloned().collect();
         let needs_outcomes = |key: &RobotKey| {

@@ -50,10 +50,10 @@ pub(super) struct ReadingQuery {
     limit: Option<u32>,
 }
 
-/// What a question asks for besides the place.
+/// Returns the parameters that all queries of friction have in common.
 ///
-/// Each query has these fields of its own: they cannot be flattened into one, since numbers do not
-/// survive that.
+/// Each query type repeats these fields: they cannot be a shared type with `#[serde(flatten)]`, which
+/// fails to parse numbers in query strings.
 fn parameters(
     as_of: Option<Timestamp>,
     configuration: Option<ConfigurationId>,

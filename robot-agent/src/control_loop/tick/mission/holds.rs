@@ -14,7 +14,7 @@ use crate::control_loop::tick::STANDING;
 use crate::control_loop::tick::sensing::SensingOutput;
 use crate::safety::microseconds;
 
-/// Time for which a base that was silent must be heard before its mission goes on.
+/// Time for which a base must send messages after a silence before its mission goes on.
 const HEARD_AGAIN_FOR: Duration = Duration::from_millis(500);
 /// Longest hold for sensors, after which the mission fails. A position finding that ends at
 /// standstill, after 10 s, leaves time for the mission to go on.
