@@ -291,7 +291,7 @@ impl RunningAgent {
     /// # Errors
     /// The thread for it cannot be started.
     pub fn notify_service_manager(&mut self) -> Result<(), StartError> {
-        if !service_manager::is_there() {
+        if !service_manager::is_present() {
             return Ok(());
         }
         let notifier = NotifierInputs {

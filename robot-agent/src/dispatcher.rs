@@ -59,7 +59,7 @@ const RESUME_WITHIN_M: f64 = 0.5;
 /// Longest wait for the loop to hold a mission for its next revision.
 const HOLD_WAIT_MAX: Duration = Duration::from_secs(5);
 /// Interval of the checks of the loop's snapshot.
-const HOLD_LOOK_EVERY: Duration = Duration::from_millis(5);
+const HOLD_POLL_EVERY: Duration = Duration::from_millis(5);
 /// Speed of a reference up to which it counts as stopped, m/s.
 const STANDS_M_S: f64 = 0.02;
 
@@ -450,7 +450,7 @@ impl Dispatcher {
                     let is_moving = speed_m_s > STANDS_M_S;
                     return Some((is_moving.then_some(governor), measured));
                 }
-                tokio::time::sleep(HOLD_LOOK_EVERY).await;
+                tokio::time::sleep(HOLD_POLL_EVERY).await;
             }
         };
         let is_known = driving.mission == mission;

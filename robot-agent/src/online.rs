@@ -29,7 +29,7 @@ use crate::outbox::Outbox;
 use crate::reporter::{Reporter, every, publish_states};
 
 /// Time for the last state to be sent before the session closes.
-const LAST_WORD_WAIT: Duration = Duration::from_millis(100);
+const LAST_STATE_WAIT: Duration = Duration::from_millis(100);
 
 /// Difference between the robot's clock and the server's from which it is logged: that from which
 /// the server raises an alert.
@@ -41,7 +41,7 @@ const LINK_FAILED_REST: Duration = Duration::from_secs(1);
 /// its router takes less.
 const LOST_GRACE: Duration = Duration::from_millis(300);
 /// Interval between two looks at the silence of the server.
-const SILENCE_LOOK_EVERY: Duration = Duration::from_millis(50);
+const SILENCE_POLL_EVERY: Duration = Duration::from_millis(50);
 
 /// Waits for the next certificate; never returns without a membership.
 async fn renewed(membership: &mut Option<watch::Receiver<Arc<Membership>>>) {
@@ -285,7 +285,7 @@ impl Online {
         let clock = &self.dispatcher.clock;
         let begun = clock.monotonic();
         loop {
-            tokio::time::sleep(SILENCE_LOOK_EVERY).await;
+            tokio::time::sleep(SILENCE_POLL_EVERY).await;
             let now = clock.monotonic();
             let silence = self.dispatcher.shared.server_silence(now);
             let silence = silence.min(now.saturating_sub(begun));
@@ -303,7 +303,7 @@ impl Online {
         let mut last = self.reporter.state();
         last.leaving = true;
         link.publish_state(&last);
-        tokio::time::sleep(LAST_WORD_WAIT).await;
+        tokio::time::sleep(LAST_STATE_WAIT).await;
     }
 
     /// Sends the introduction on every new connection until it is answered.

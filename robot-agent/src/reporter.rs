@@ -30,7 +30,7 @@ use crate::state_rate::{PublishRate, PublishTimes};
 /// Longest wait for the loop before a change is published: two ticks of the slowest loop.
 const TICK_WAIT_MAX: Duration = Duration::from_millis(100);
 /// Interval of the checks of the loop's ticks, and the shortest time between two published changes.
-const TICK_LOOK_EVERY: Duration = Duration::from_millis(2);
+const TICK_POLL_EVERY: Duration = Duration::from_millis(2);
 
 /// Builds and publishes the robot's state.
 #[derive(Debug)]
@@ -188,13 +188,13 @@ impl Reporter {
     }
 
     /// Waits until the loop has processed a recent change, so that the published mode includes it.
-    async fn loop_has_seen(&self) {
+    async fn await_loop_update(&self) {
         let ticks = || self.shared.ticks.load(Ordering::Relaxed);
         // A tick that has begun may not have read the change.
         let seen = ticks() + 2;
         let ticking = async {
             while ticks() < seen {
-                tokio::time::sleep(TICK_LOOK_EVERY).await;
+                tokio::time::sleep(TICK_POLL_EVERY).await;
             }
         };
         // If the loop does not tick, its last snapshot is published.
@@ -300,7 +300,7 @@ pub(crate) async fn publish_states(link: Arc<FleetLink>, reporter: &Reporter) {
     loop {
         tokio::select! {
             () = times.next() => {}
-            () = reporter.safety.changed() => reporter.loop_has_seen().await,
+            () = reporter.safety.changed() => reporter.await_loop_update().await,
         }
         link.publish_state(&reporter.state());
     }

@@ -68,7 +68,7 @@ pub(crate) struct NotifierInputs {
 }
 
 /// Returns whether a service manager waits for messages.
-pub(crate) fn is_there() -> bool {
+pub(crate) fn is_present() -> bool {
     std::env::var_os("NOTIFY_SOCKET").is_some()
 }
 

@@ -459,7 +459,7 @@ impl RunningServer {
     /// Tells the service manager that started this process, if any, that the server is ready, and
     /// from then on that it lives, until the stop.
     fn notify_service_manager(&self) {
-        if service_manager::is_there() {
+        if service_manager::is_present() {
             let address = format!("{}://{}", self.scheme, self.http_address);
             let (supervisor, app) = (&self.supervisor, self.app.clone());
             let (liveness, stop) = (supervisor.liveness(), supervisor.stop_token());

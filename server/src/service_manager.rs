@@ -54,7 +54,7 @@ fn send(messages: &[NotifyState<'_>]) -> io::Result<()> {
 }
 
 /// Returns whether a service manager waits for messages.
-pub(crate) fn is_there() -> bool {
+pub(crate) fn is_present() -> bool {
     std::env::var_os("NOTIFY_SOCKET").is_some()
 }
 

@@ -11,13 +11,13 @@ use tread_api::ids::MissionId;
 use tread_api::mission::{Mission, MissionState};
 
 use super::mission_text::{state, summary};
-use super::robots::steps_come;
+use super::robots::steps_driven;
 use crate::args::format_duration;
 use crate::client::Client;
 use crate::output::{Output, WaitTimeout, print_note};
 
 /// Polling period of the missions.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
+const POLL_EVERY: Duration = Duration::from_millis(250);
 /// Number of steps of a bar.
 const STEPS: usize = 1_000;
 
@@ -43,7 +43,7 @@ impl AwaitedMission {
         self.bar.set_prefix(mission.robot.to_string());
         let steps = mission
             .progress
-            .and_then(|it| Some((it, steps_come(it, STEPS)?)));
+            .and_then(|it| Some((it, steps_driven(it, STEPS)?)));
         let Some((progress, steps)) = steps else {
             self.bar.set_message(state(mission));
             return;
@@ -130,7 +130,7 @@ pub(super) async fn wait(
             );
             return Err(WaitTimeout(text).into());
         }
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_EVERY).await;
     }
 }
 

@@ -94,7 +94,7 @@ const THETA_INITIAL: f64 = 0.2;
 /// Range of plausible θ; an estimate outside it is not a measurement.
 const THETA_RANGE: std::ops::RangeInclusive<f64> = 5.0e-3..=10.0;
 /// Upper bound of θ before the first measurement.
-const THETA_MOST_FIRST: f64 = 2.0;
+const THETA_INITIAL_MAX: f64 = 2.0;
 /// Relative error of θ from rows on accelerations because they neglect products of θ with
 /// parameters that are still being estimated. It is common to all of a robot's segments; with
 /// torque the error of the torque constants takes its place.
@@ -188,7 +188,7 @@ impl Estimator {
                 theta: None,
                 slip_max: f64::INFINITY,
                 theta_weights: THETA_INITIAL,
-                theta_most: THETA_MOST_FIRST,
+                theta_most: THETA_INITIAL_MAX,
             },
             estimate: Estimate::default(),
             measured: None,
@@ -422,7 +422,7 @@ impl Estimator {
             Some(identification) => identification.identified().and_then(measurement),
             None => of_rows,
         };
-        let most = solution.map_or(THETA_MOST_FIRST, |found| {
+        let most = solution.map_or(THETA_INITIAL_MAX, |found| {
             found.theta.max(0.0) + 2.0 * found.variance.max(0.0).sqrt()
         });
         self.bound = ThetaBound {
@@ -439,7 +439,7 @@ impl Estimator {
             theta_most: if of_rows.is_some() {
                 most
             } else {
-                most.min(THETA_MOST_FIRST)
+                most.min(THETA_INITIAL_MAX)
             },
         };
         self.estimate = Estimate {

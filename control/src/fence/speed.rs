@@ -159,7 +159,7 @@ impl Fence {
 
     /// Returns whether a motion of a robot outside increases the clearance of its centre, which is
     /// `clearance_m`, or leaves the disc in place.
-    fn leads_back(&self, pose: Pose, twist: Twist, clearance_m: f64) -> bool {
+    fn returns_inside(&self, pose: Pose, twist: Twist, clearance_m: f64) -> bool {
         if twist.linear_m_s.abs() < 1.0e-6 {
             // Turning on the spot leaves the disc where it is.
             return true;
@@ -204,7 +204,7 @@ impl Fence {
         };
         if clearance_m < STEP_MIN_M {
             return cap(
-                if self.leads_back(input.pose, input.requested, centre_clearance_m) {
+                if self.returns_inside(input.pose, input.requested, centre_clearance_m) {
                     RETURN_MAX_M_S
                 } else {
                     0.0

@@ -2,9 +2,9 @@
 //! stopped when zero velocity is commanded.
 //!
 //! ```text
-//!            zero is commanded              at zero velocity for STANDS_FOR
+//!            zero is commanded              at zero velocity for STANDSTILL_MIN
 //! driving ───────────────────────► stopping ────────────────────────────────► stopped
-//!    ▲                                │ braking time and MARGIN are over          │ moves for MOVES_FOR
+//!    ▲                                │ braking time and MARGIN are over          │ moves for MOTION_MIN
 //!    │                                ▼                                          ▼
 //!    └─ zero is not commanded ─ does not stand ◄────────────────────────── moves while stopped
 //! ```
@@ -25,12 +25,12 @@ const DISTANCE_MIN_M: f64 = 0.3;
 /// Number of consecutive fixes beyond [`DISTANCE_MIN_M`] that shows motion.
 const FIXES: u32 = 3;
 /// Time without motion after which the robot counts as stopped.
-const STANDS_FOR: Duration = Duration::from_millis(300);
+const STANDSTILL_MIN: Duration = Duration::from_millis(300);
 /// Time for which fixes must stay within [`DISTANCE_MIN_M`] where they are the only evidence of
 /// standstill: a creeping robot leaves that circle meanwhile.
 const FIXES_STAY_FOR: Duration = Duration::from_secs(3);
 /// Duration of motion from which it is reported.
-const MOVES_FOR: Duration = Duration::from_millis(300);
+const MOTION_MIN: Duration = Duration::from_millis(300);
 /// Smallest deceleration assumed for the braking time, m/s²: half of that on unknown ground.
 const BRAKING_M_S2: f64 = 0.7;
 /// Upper bound of the assumed braking time.
@@ -129,7 +129,7 @@ impl StandingWatch {
                 };
                 since
             };
-            if now.saturating_sub(since) >= STANDS_FOR {
+            if now.saturating_sub(since) >= STANDSTILL_MIN {
                 let took = since.saturating_sub(commanded_at);
                 self.stands.get_or_insert((since, took));
                 if self.anchor.is_none() {
@@ -141,7 +141,7 @@ impl StandingWatch {
         };
         (self.still_since, self.first_fix) = (None, None);
         let since = *self.moving_since.get_or_insert(now);
-        let lasts = now.saturating_sub(since) >= MOVES_FOR;
+        let lasts = now.saturating_sub(since) >= MOTION_MIN;
         if self.stands.is_some() {
             if lasts {
                 self.moves = Some(evidence);

@@ -47,7 +47,7 @@ use crate::geometry::control_model;
 /// Time for which the doctor listens to the stopped robot.
 const LISTEN_FOR: Duration = Duration::from_secs(3);
 /// Maximum wait for the first message.
-const FIRST_WORD_MAX: Duration = Duration::from_secs(5);
+const FIRST_MESSAGE_WAIT_MAX: Duration = Duration::from_secs(5);
 /// Time between two commands.
 const PERIOD: Duration = Duration::from_millis(10);
 /// Duration of the ramp from zero to full speed, and back.
@@ -156,7 +156,7 @@ fn examine_base(
         command: WheelSpeeds::default(),
         parameters: Parameters::new(model, config.prior),
     };
-    let until = examined.clock.monotonic() + FIRST_WORD_MAX;
+    let until = examined.clock.monotonic() + FIRST_MESSAGE_WAIT_MAX;
     while buffer.is_empty() && examined.clock.monotonic() < until {
         examined.hold(WheelSpeeds::default(), PERIOD);
     }

@@ -19,7 +19,7 @@ const STANDING_SHARE: f64 = 0.2;
 /// Smallest yaw rate of a robot that turns, rad/s.
 const TURNING_RAD_S: f64 = 0.05;
 /// Ratio to the wheels' speed below which a robot counts as not moving over ground.
-const GOING_SHARE: f64 = 0.3;
+const DRIVING_RATIO_MIN: f64 = 0.3;
 /// Largest accepted relative error of the wheel radius.
 const RADIUS_SHARE: f64 = 0.06;
 
@@ -81,7 +81,7 @@ pub(super) fn findings(
         .filter(|_| !frozen.odometry && is_twist_well));
     let turn_rad_s = turned.turn_rad_s.filter(|_| !frozen.gyro);
     let turn_rad_s = turn_rad_s.map(|rate| rate - gyro_bias_rad_s);
-    let is_driving = |ground_m_s: &f64| ground_m_s.abs() > GOING_SHARE * rim_m_s.abs();
+    let is_driving = |ground_m_s: &f64| ground_m_s.abs() > DRIVING_RATIO_MIN * rim_m_s.abs();
     let is_turning = |rate: &f64| rate.abs() > TURNING_RAD_S;
     let answers = Answers {
         turn: directions(turning, turned),

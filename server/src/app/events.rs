@@ -217,7 +217,7 @@ impl App {
         filter: &EventFilter,
     ) -> Result<VecDeque<Arc<Sent>>, AppError> {
         let read = self.hub().read_elsewhere(last);
-        let Some((run, at)) = read.filter(|_| filter.wants(Topic::Missions)) else {
+        let Some((run, at)) = read.filter(|_| filter.includes_topic(Topic::Missions)) else {
             return Ok(VecDeque::new());
         };
         let after = at.step.max(until - i64::from(STEPS_MISSED_MAX));

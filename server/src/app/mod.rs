@@ -243,7 +243,11 @@ impl App {
     }
 
     /// Starts a background task that the request does not wait for. The task must be finite.
-    pub fn pass_by(&self, name: &'static str, task: impl Future<Output = ()> + Send + 'static) {
+    pub fn spawn_background(
+        &self,
+        name: &'static str,
+        task: impl Future<Output = ()> + Send + 'static,
+    ) {
         self.supervisor().spawn_passing(name, task);
     }
 

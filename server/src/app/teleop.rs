@@ -53,7 +53,7 @@ const RELEASE_TRIES: u32 = 5;
 /// Wait between two attempts.
 const RELEASE_RETRY: Duration = Duration::from_millis(300);
 /// Validity of a command with zero velocity: as long as the robot would take to stop by itself.
-const STAND_FOR: Duration = Duration::from_millis(250);
+const STOP_COMMAND_VALIDITY: Duration = Duration::from_millis(250);
 /// Maximum time that a new driver waits until holding the missions is stored.
 const HOLD_WAIT_MAX: Duration = Duration::from_millis(300);
 /// Wait between two attempts to store it.
@@ -369,7 +369,7 @@ impl Session {
     /// Releases the lease, after a command with zero velocity. Returns whether the session had one.
     pub fn release(&mut self) -> bool {
         // If the robot's clock is not known, the robot stops when its last command ends.
-        let _ = self.send(Twist::default(), STAND_FOR);
+        let _ = self.send(Twist::default(), STOP_COMMAND_VALIDITY);
         match self.active.take() {
             Some(active) => {
                 self.return_lease(active.lease, active.granted);

@@ -1,14 +1,14 @@
 //! Requests states of watched robots at a higher rate.
 //!
 //! A robot is watched while a drive socket of it is open. Its agent gets a request for
-//! [`WATCHED_STATE_RATE_HZ`] that lasts [`ASK_FOR`], again every [`ASK_PERIOD`]; when no socket is
+//! [`WATCHED_STATE_RATE_HZ`] that lasts [`REQUEST_DURATION`], again every [`REQUEST_PERIOD`]; when no socket is
 //! left, the agent returns to its own rate by itself.
 //!
 //! ```text
-//! watched, online ──► asked ──done──► due after ASK_PERIOD
-//!                       ├──no answer──► due after ASK_PERIOD; after TRIES_MAX of a run that never
-//!                       │               answered, due after REST
-//!                       └──refused, not understood──► due after REST
+//! watched, online ──► asked ──done──► due after REQUEST_PERIOD
+//!                       ├──no answer──► due after REQUEST_PERIOD; after TRIES_MAX of a run that never
+//!                       │               answered, due after REQUEST_PAUSE
+//!                       └──refused, not understood──► due after REQUEST_PAUSE
 //! ```
 //!
 //! An agent of an older release does not answer the command. Another run of an agent is asked anew.
@@ -30,17 +30,17 @@ use super::presence::RobotKey;
 use super::robot_link::Undelivered;
 
 /// Duration of one request: two of them may be lost without an effect.
-pub const ASK_FOR: Duration = Duration::from_secs(5);
+pub const REQUEST_DURATION: Duration = Duration::from_secs(5);
 /// Interval of the requests to one robot.
-pub const ASK_PERIOD: Duration = Duration::from_millis(1_500);
-/// Number of unanswered requests after which a run that never answered gets none for [`REST`].
+pub const REQUEST_PERIOD: Duration = Duration::from_millis(1_500);
+/// Number of unanswered requests after which a run that never answered gets none for [`REQUEST_PAUSE`].
 pub const TRIES_MAX: u32 = 3;
 /// Time without requests to a run that refused, or that never answered.
-pub const REST: Duration = Duration::from_mins(10);
+pub const REQUEST_PAUSE: Duration = Duration::from_mins(10);
 /// Maximum number of requests under way.
-pub const ASKED_AT_ONCE_MAX: usize = 32;
+pub const REQUESTS_AT_ONCE_MAX: usize = 32;
 /// Interval of checks for robots that are due.
-const LOOK_PERIOD: Duration = Duration::from_millis(250);
+const CHECK_PERIOD: Duration = Duration::from_millis(250);
 /// Maximum number of unwatched robots whose last answer is kept.
 pub const REMEMBERED_MAX: usize = 4_096;
 
@@ -184,15 +184,15 @@ impl Watched {
         if rests {
             run.unanswered = 0;
         }
-        run.due = now + if rests { REST } else { ASK_PERIOD };
+        run.due = now + if rests { REQUEST_PAUSE } else { REQUEST_PERIOD };
     }
 }
 
 impl Run {
     /// Returns whether dropping this state would change nothing: a new state would be due now too.
-    fn is_as_new(&self, now: Duration) -> bool {
+    fn is_disposable(&self, now: Duration) -> bool {
         let forgotten_at = if self.unanswered > 0 {
-            self.due.saturating_add(REST)
+            self.due.saturating_add(REQUEST_PAUSE)
         } else {
             self.due
         };
@@ -204,7 +204,11 @@ impl Run {
 /// other unwatched robots, and drops those that are due first.
 fn evict_idle(robots: &mut HashMap<RobotKey, Robot>, now: Duration) {
     robots.retain(|_, robot| {
-        robot.watchers > 0 || robot.run.as_ref().is_some_and(|run| !run.is_as_new(now))
+        robot.watchers > 0
+            || robot
+                .run
+                .as_ref()
+                .is_some_and(|run| !run.is_disposable(now))
     });
     let unwatched = robots.values().filter(|robot| robot.watchers == 0).count();
     if unwatched <= REMEMBERED_MAX {
@@ -231,7 +235,7 @@ impl App {
         let (key, boot) = &run;
         let command = StateRate {
             rate_hz: WATCHED_STATE_RATE_HZ,
-            for_ms: u64::try_from(ASK_FOR.as_millis()).unwrap_or(u64::MAX),
+            for_ms: u64::try_from(REQUEST_DURATION.as_millis()).unwrap_or(u64::MAX),
         };
         self.counters().state_rates_asked.one();
         let answer = self.commands().send_to(key, Some(*boot), &command).await;
@@ -254,11 +258,11 @@ impl App {
 pub async fn run(app: App, stop: CancellationToken) {
     let watched = app.watched().clone();
     let mut requests = FuturesUnordered::new();
-    let mut looks = tokio::time::interval(LOOK_PERIOD);
+    let mut looks = tokio::time::interval(CHECK_PERIOD);
     looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
         let has_more = {
-            let room = ASKED_AT_ONCE_MAX.saturating_sub(requests.len());
+            let room = REQUESTS_AT_ONCE_MAX.saturating_sub(requests.len());
             let now = app.clock().elapsed();
             let online = |key: &RobotKey| app.presences().online_run(key, now);
             let (due, has_more) = watched.due(online, now, room);

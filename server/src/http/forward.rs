@@ -386,7 +386,7 @@ fn join(
     *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
     *response.headers_mut() = answer.headers().clone();
     let stop = app.supervisor().stop_token();
-    app.pass_by("forwarded connection", async move {
+    app.spawn_background("forwarded connection", async move {
         let (Ok(ours), Ok(theirs)) = tokio::join!(upgrade, answer.upgrade()) else {
             debug!("a connection that was to be forwarded is closed");
             return;

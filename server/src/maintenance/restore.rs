@@ -19,7 +19,7 @@ use clap::Args;
 use jiff::Timestamp;
 
 use super::review::{self, Review};
-use super::unfinished::{BESIDE, Unfinished, with_ending};
+use super::unfinished::{SQLITE_SUFFIXES, Unfinished, with_ending};
 use super::{ServerFiles, file_of};
 use crate::app::backups::check_space;
 use crate::authority::{AuthorityError, CERTIFICATE_FILE, copies};
@@ -37,7 +37,7 @@ use crate::paths::folder_of;
 /// Suffix of the database while it is restored.
 const RESTORING_ENDING: &str = ".restoring";
 /// Infix of the names of files and folders that were moved aside.
-const ASIDE: &str = ".before-restore-";
+const REPLACED_INFIX: &str = ".before-restore-";
 /// Free space for the log of the database while it is prepared, MiB.
 const LOG_MIB: u64 = 16;
 const BYTES_PER_MIB: u64 = 1024 * 1024;
@@ -217,7 +217,7 @@ async fn replace(
     // SQLite would use a log beside the new database as that database's log, also where there is no
     // old one. After a crash here the old database lacks its log, which is among the files that were
     // moved aside.
-    for ending in BESIDE {
+    for ending in SQLITE_SUFFIXES {
         let beside = with_ending(database, ending);
         if beside.exists() {
             let renamed = fs::rename(&beside, with_ending(&to, ending));
@@ -237,7 +237,7 @@ async fn replace(
 /// Returns a name that no other file has: of two restorations within a second, the second has a number.
 fn unused_name(path: &Path, now: Timestamp) -> PathBuf {
     let time = now.strftime("%Y%m%dT%H%M%SZ");
-    let first = with_ending(path, &format!("{ASIDE}{time}"));
+    let first = with_ending(path, &format!("{REPLACED_INFIX}{time}"));
     let numbered = (2_u32..).map(|number| with_ending(&first, &format!("-{number}")));
     let mut names = std::iter::once(first.clone()).chain(numbered);
     names.find(|name| !name.exists()).unwrap_or(first)

@@ -13,11 +13,11 @@ use tread_api::safety::StandingState;
 use super::site_state::SiteState;
 use super::view::{Order, Section, View};
 use crate::commands::mission_text::{state, trajectory};
-use crate::commands::robots::{details, link_name, mode_name, steps_come, theta};
+use crate::commands::robots::{details, link_name, mode_name, steps_driven, theta};
 use crate::output::{age, fixed, or_dash};
 
 /// Maximum width of a robot's name, columns.
-const NAME_MOST: usize = 24;
+const NAME_WIDTH_MAX: usize = 24;
 /// Width of a progress bar, columns.
 const BAR: usize = 10;
 /// Minimum width of the screen, columns, for whole identifiers and additional columns of robots.
@@ -154,7 +154,7 @@ fn head(picture: &Picture<'_>) -> Vec<Line<'static>> {
 
 /// Returns a progress bar of a mission.
 fn bar(progress: Option<MissionProgress>) -> String {
-    let Some((progress, full)) = progress.and_then(|it| Some((it, steps_come(it, BAR)?))) else {
+    let Some((progress, full)) = progress.and_then(|it| Some((it, steps_driven(it, BAR)?))) else {
         return "-".to_owned();
     };
     let share = (progress.driven_m / progress.length_m).clamp(0.0, 1.0);
@@ -246,7 +246,7 @@ fn draw_robots(frame: &mut Frame<'_>, area: Rect, picture: &Picture<'_>) {
         "ROBOT", "LINK", "MODE", "DONE", "M/S", "OFF MM", "THETA", "HEARD",
     ];
     let names = robots.iter().map(|robot| robot.id.as_str().len());
-    let longest = names.max().unwrap_or_default().clamp(8, NAME_MOST);
+    let longest = names.max().unwrap_or_default().clamp(8, NAME_WIDTH_MAX);
     let mut widths = vec![
         Constraint::Length(u16::try_from(longest).unwrap_or_default()),
         Constraint::Length(7),

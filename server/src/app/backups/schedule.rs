@@ -22,7 +22,7 @@ pub const BACKUP_FAILED_ALERT: &str = "backup-failed";
 /// Code of the alert about a last backup that is too old.
 pub const BACKUP_OLD_ALERT: &str = "backup-old";
 /// Interval at which the server checks whether a backup is due.
-const LOOK_EVERY: Duration = Duration::from_secs(1);
+const CHECK_EVERY: Duration = Duration::from_secs(1);
 /// Interval at which the folder is read again: people may remove or add backups.
 const LIST_EVERY: Duration = Duration::from_mins(1);
 /// Time after a failure before the next attempt.
@@ -83,7 +83,7 @@ pub async fn run(app: App, schedule: Option<Schedule>, stop: CancellationToken) 
         }
         tokio::select! {
             () = stop.cancelled() => {}
-            () = tokio::time::sleep(LOOK_EVERY) => {}
+            () = tokio::time::sleep(CHECK_EVERY) => {}
         }
     }
 }

@@ -59,7 +59,7 @@ const USED_MAX: usize = 4_096;
 const FIND_AGAIN_MIN: Duration = Duration::from_secs(1);
 const FIND_AGAIN_MAX: Duration = Duration::from_secs(30);
 /// Interval at which the metadata of a known provider are read again.
-const LOOK_AGAIN: Duration = Duration::from_hours(1);
+const METADATA_REFRESH: Duration = Duration::from_hours(1);
 
 /// Reason why a person is not signed in.
 #[derive(Debug, thiserror::Error)]
@@ -408,7 +408,7 @@ impl App {
         }
         let mut signed_in = people.signed_in(&authenticated)?;
         signed_in.name = self
-            .unlike_tokens(signed_in.name, &authenticated.subject)
+            .distinct_from_tokens(signed_in.name, &authenticated.subject)
             .await?;
         let expires_at = now.checked_add(people.session_lasts);
         let expires_at = expires_at.unwrap_or(Timestamp::MAX);
@@ -422,7 +422,7 @@ impl App {
 
     /// Returns a name for the person that differs from the name of every valid token. New tokens
     /// cannot have such a name, but those of earlier versions may.
-    async fn unlike_tokens(&self, name: String, subject: &str) -> Result<String, AppError> {
+    async fn distinct_from_tokens(&self, name: String, subject: &str) -> Result<String, AppError> {
         let mut tx = self.db().read("identity").await?;
         let called = name_of_person(&name);
         let taken = db::tokens::valid_by_name(&mut tx, &called, self.clock().now()).await?;
@@ -460,7 +460,7 @@ pub async fn run(app: App, stop: CancellationToken) {
                     info!("people can sign in at {}", people.issuer());
                 }
                 rest = FIND_AGAIN_MIN;
-                LOOK_AGAIN
+                METADATA_REFRESH
             }
             Err(error) => {
                 app.log_failure("find the OpenID provider", &error);

@@ -233,7 +233,7 @@ async fn apply_phase(
     // The robot's answer to the command has caused this transition already.
     let is_known = open && next_is_reached(change, mission);
     // An agent that was killed while it recorded this end reports it again.
-    let is_known = is_known || has_ended_so(tx, mission, change, reason).await?;
+    let is_known = is_known || has_same_end(tx, mission, change, reason).await?;
     if is_known {
         return Ok(None);
     }
@@ -247,7 +247,7 @@ async fn apply_phase(
 
 /// Returns whether the robot's own report has ended the mission already by this change and for this
 /// reason.
-async fn has_ended_so(
+async fn has_same_end(
     tx: &mut Tx,
     mission: &Mission,
     change: Change,

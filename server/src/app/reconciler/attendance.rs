@@ -30,7 +30,7 @@ pub(in crate::app) const LOST_AFTER: Duration = Duration::from_secs(15);
 /// Time for which a robot must be heard again before its alert is cleared.
 pub(in crate::app) const BACK_AFTER: Duration = Duration::from_secs(3);
 /// Minimum interval between two checks: in a large fleet the reconciler is woken far more often.
-const LOOK_EVERY: Duration = Duration::from_millis(500);
+const CHECK_EVERY: Duration = Duration::from_millis(500);
 /// Time after the start of the server in which no robot counts as lost, since all of them must
 /// reconnect.
 pub(in crate::app) const START_GRACE: Duration = Duration::from_secs(30);
@@ -110,7 +110,7 @@ impl Attendance {
     /// The database failed; the next check repeats this one.
     pub(super) async fn check(&mut self, app: &App) -> Result<(), AppError> {
         let elapsed = app.clock().elapsed();
-        let is_early = |looked_at: Duration| elapsed.saturating_sub(looked_at) < LOOK_EVERY;
+        let is_early = |looked_at: Duration| elapsed.saturating_sub(looked_at) < CHECK_EVERY;
         if self.looked_at.is_some_and(is_early) {
             return Ok(());
         }
@@ -131,7 +131,7 @@ impl Attendance {
                 silent: attending.silent_for.unwrap_or(now.uptime),
             };
             if let Some(turn) = seen.judge(observed, now) {
-                write_down(app, &key, turn, attending.cause).await?;
+                store_transition(app, &key, turn, attending.cause).await?;
                 seen.apply(turn);
             }
         }
@@ -154,7 +154,7 @@ async fn expected(app: &App) -> Result<HashMap<RobotKey, RobotAttendance>, AppEr
     Ok(expected.into_iter().map(seen).collect())
 }
 
-async fn write_down(
+async fn store_transition(
     app: &App,
     key: &RobotKey,
     turn: Turn,
@@ -171,7 +171,7 @@ async fn write_down(
     let is_there = matches!(turn, Turn::Came | Turn::Back);
     db::attendance::set_present(&mut tx, row.pk, is_there).await?;
     // No alert for a robot that was retired or revoked.
-    let is_missed = row.retired_at.is_none() && app.enrolment_registry().may_speak(key);
+    let is_missed = row.retired_at.is_none() && app.enrolment_registry().may_send(key);
     let alert = match turn {
         Turn::Lost if is_missed => {
             let alert = OwnAlert {

@@ -357,8 +357,8 @@ impl Reconciler {
             let presence = self.app.presences().get(&key);
             let job = Job::Stop(stop.id);
             // Any sign of the agent suffices, even if its control loop has stopped.
-            let is_there = presence.is_there(self.app.clock().elapsed());
-            if is_there && self.is_due(&job) {
+            let is_connected = presence.is_connected(self.app.clock().elapsed());
+            if is_connected && self.is_due(&job) {
                 let app = self.app.clone();
                 self.start(job, stop_again(app, stop));
             }

@@ -208,7 +208,7 @@ impl Dispatcher {
             // There is room for every attempt that is under way, unless the server stops.
             let _ = finished.try_send(done);
         };
-        self.app.pass_by("webhook", attempt);
+        self.app.spawn_background("webhook", attempt);
     }
 
     /// Notes how an attempt ended.

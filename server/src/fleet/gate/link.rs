@@ -44,7 +44,7 @@ const BUFFER_BYTES: usize = 4 * 1024;
 const REFUSED_CLOSE_MAX: Duration = Duration::from_millis(500);
 const REFUSED_BYTES_MAX: u64 = 16 * 1024;
 /// Number of bytes of a connection that are inspected first.
-const LOOKED_AT_BYTES: usize = 6;
+const INSPECTED_BYTES: usize = 6;
 /// What the log says of a robot whose certificate has expired.
 const EXPIRED: &str = "admit a robot whose certificate has expired (it renews it while it reaches the REST API; otherwise \
      compare its clock with this one, or let it join again by `tread-agent enroll`)";
@@ -116,7 +116,7 @@ impl Link {
             let (rate, clock) = (entry.byte_rate(), self.app.clock());
             let paused = |now| {
                 counters.gate_throttled.one();
-                if rate.is_to_be_logged(now) {
+                if rate.should_log(now) {
                     warn!(robot.id = %robot.1, "robot `{}` sends more than {BYTES_PER_S} bytes a second, and is read no faster", robot.1);
                 }
             };
@@ -150,7 +150,7 @@ impl Link {
     /// Authenticates the client; `None` if it is rejected.
     async fn authenticate_client(&self, stream: TcpStream) -> Option<Admitted> {
         let counters = self.app.counters();
-        let mut begin = [0; LOOKED_AT_BYTES];
+        let mut begin = [0; INSPECTED_BYTES];
         let first = tokio::time::timeout(FIRST_BYTE_TIMEOUT, stream.peek(&mut begin)).await;
         let Ok(Ok(length @ 1..)) = first else {
             counters.gate_silent.one();

@@ -160,7 +160,7 @@ pub struct Group<'map> {
 
 impl Group<'_> {
     /// Returns whether any pass has information.
-    fn tells(&self) -> bool {
+    fn has_information(&self) -> bool {
         !self.seen.is_empty()
     }
 }
@@ -424,7 +424,10 @@ impl SiteMap {
                 None => group.uninformative_passes += sums.segments,
             }
         }
-        groups.into_values().filter(Group::tells).collect()
+        groups
+            .into_values()
+            .filter(Group::has_information)
+            .collect()
     }
 
     /// Returns whether measurements of this robot and configuration are chosen.
@@ -472,7 +475,7 @@ impl SiteMap {
                 None => groups[index].uninformative_passes += part.passes(),
             }
         }
-        groups.retain(Group::tells);
+        groups.retain(Group::has_information);
         groups.sort_unstable_by_key(|group| (group.terrain, group.configuration));
         groups
     }

@@ -396,7 +396,7 @@ fn end_with(app: &App, subject: Arc<Credential>, cut: Option<Cut>, response: Res
     // A body is not polled while the client reads slowly, so a separate task watches.
     let given = CancellationToken::new();
     let guard = given.clone().drop_guard();
-    app.pass_by("download", async move {
+    app.spawn_background("download", async move {
         tokio::select! {
             () = given.cancelled() => {}
             () = over => {

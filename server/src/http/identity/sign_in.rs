@@ -23,7 +23,7 @@ use crate::http::extract::{Json, Query};
 use crate::http::page;
 use crate::http::problem::Problem;
 use crate::identity::origin::Names;
-use crate::identity::pending::SIGN_IN_LASTS;
+use crate::identity::pending::SIGN_IN_TIMEOUT;
 
 /// Target of the redirect after a sign-in; the fragment makes the page request the session's user.
 const SIGNED_IN: &str = "/#signed-in";
@@ -52,7 +52,7 @@ pub(in crate::http) async fn begin(
     };
     let mut response = see_other(&begun.location);
     if let Some(cookie) = &begun.cookie {
-        let (headers, lasts_s) = (response.headers_mut(), SIGN_IN_LASTS.as_secs());
+        let (headers, lasts_s) = (response.headers_mut(), SIGN_IN_TIMEOUT.as_secs());
         browser::set_sign_in_cookie(headers, names.is_tls, cookie, lasts_s);
     }
     response
