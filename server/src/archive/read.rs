@@ -54,16 +54,16 @@ impl OpenFile {
             let footer = checksum::read_footer(&source)?;
             let metadata = ParquetMetaDataReader::decode_metadata(&footer.bytes)?;
             let about = metadata.file_metadata();
-            let metadata = about.key_value_metadata().map_or(&[][..], Vec::as_slice);
-            if value_of(metadata, schema::FORMAT_KEY) != Some(schema::FORMAT) {
+            let key_values = about.key_value_metadata().map_or(&[][..], Vec::as_slice);
+            if value_of(key_values, schema::FORMAT_KEY) != Some(schema::FORMAT) {
                 return Err(fault("it is not of this format"));
             }
             if about.schema() != &schema::columns()? {
                 return Err(fault("it has other columns"));
             }
-            let follows = value_of(metadata, schema::FOLLOWS_KEY);
+            let follows = value_of(key_values, schema::FOLLOWS_KEY);
             let follows = follows.and_then(|follows| follows.parse().ok());
-            let groups = value_of(metadata, schema::ROW_GROUPS_KEY).unwrap_or_default();
+            let groups = value_of(key_values, schema::ROW_GROUPS_KEY).unwrap_or_default();
             let counts = metadata.row_groups().iter();
             let counts: Vec<i64> = counts.map(RowGroupMetaData::num_rows).collect();
             let groups = groups_of(groups, &counts, keys, footer.begin);

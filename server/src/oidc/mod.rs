@@ -374,7 +374,7 @@ impl Provider {
             metadata_used = newer;
             verified = verified_with(metadata_used.jwks());
         }
-        let (subject, mut claims) = believed.map_err(ExchangeError::Invalid)?;
+        let (subject, mut claims) = verified.map_err(ExchangeError::Invalid)?;
         if claim(&claims, &self.groups_claim).is_none()
             && let Some(endpoint) = metadata.userinfo_endpoint()
         {
