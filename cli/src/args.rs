@@ -98,10 +98,10 @@ fn refuse_for_programs(error: &clap::Error) -> ! {
         .lines()
         .map(str::trim)
         .take_while(|line| !line.is_empty());
-    let said = first.collect::<Vec<_>>().join(" ");
-    let said = said.strip_prefix("error: ").unwrap_or(&said);
+    let message = first.collect::<Vec<_>>().join(" ");
+    let message = message.strip_prefix("error: ").unwrap_or(&message);
     let next_step = "see the same command with --help for its arguments";
-    print_note(&failure(said, Exit::Usage, Some(next_step), None).to_string());
+    print_note(&failure(message, Exit::Usage, Some(next_step), None).to_string());
     std::process::exit(error.exit_code())
 }
 

@@ -1,9 +1,9 @@
-//! Tokens with which the user has signed in, by server, in a file that only the user can read. Beside
-//! it are a file with the fingerprints by which servers are trusted, and one with the server of the
-//! last login.
+//! Stores the user's tokens, one for each server, in a file that only the user can read. The same
+//! folder has a file with the fingerprints of trusted servers, and one with the server of the last
+//! login.
 //!
-//! A token is taken from the first of: `--token-file`, the environment variable `TREAD_TOKEN`, this
-//! file.
+//! Order of precedence of the sources of a token: `--token-file`, the environment variable
+//! `TREAD_TOKEN`, this file.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -138,9 +138,9 @@ impl Store {
     /// Deletes the token of a server; with `only`, only if it equals that token.
     pub(crate) fn remove(&self, address: &str, only: Option<&str>) -> anyhow::Result<()> {
         self.change(|kept| {
-            let kept_one = kept.get(address);
-            let goes = kept_one.is_some_and(|kept| only.is_none_or(|only| only == kept));
-            goes && kept.remove(address).is_some()
+            let stored = kept.get(address);
+            let is_removed = stored.is_some_and(|kept| only.is_none_or(|only| only == kept));
+            is_removed && kept.remove(address).is_some()
         })
     }
 

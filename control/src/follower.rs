@@ -444,8 +444,8 @@ impl Follower {
                 self.enter(FollowerStatus::Tracking);
             }
             FollowerStatus::Settling => {
-                let there = self.last_errors.distance_m() < config.end_tolerance_m && standing;
-                self.hold_s = if there { self.hold_s + dt_s } else { 0.0 };
+                let settled = self.last_errors.distance_m() < config.end_tolerance_m && standing;
+                self.hold_s = if settled { self.hold_s + dt_s } else { 0.0 };
                 if self.hold_s >= config.settle_hold_s {
                     self.enter(FollowerStatus::Done);
                 } else if self.phase_s > config.settle_max_s {

@@ -111,8 +111,8 @@ impl GovernorInput {
         }
         let rate_at =
             |lag_m: f64| ((LAG_FULL_M - lag_m) / (LAG_FULL_M - LAG_FREE_M)).clamp(0.0, 1.0);
-        let beside = CROSS_TRACK_RATE_MIN * rate_at(self.along_track_m.abs());
-        rate_at(self.lag_m).max(beside)
+        let lateral_rate = CROSS_TRACK_RATE_MIN * rate_at(self.along_track_m.abs());
+        rate_at(self.lag_m).max(lateral_rate)
     }
 }
 
@@ -225,11 +225,15 @@ impl Governor {
         let mut energy = f64::INFINITY;
         for step in 0..=SLIDING_STEPS {
             let ahead_s = SLIDING_AHEAD_S * f64::from(step) / f64::from(SLIDING_STEPS);
-            let there = plan.sample(self.clock_s + ahead_s);
-            let bend_1_m = there.path.curvature_1_m.abs().max(f64::MIN_POSITIVE);
-            let slope_1_m2 = there.path.curvature_slope_1_m2.abs().max(f64::MIN_POSITIVE);
+            let sample = plan.sample(self.clock_s + ahead_s);
+            let bend_1_m = sample.path.curvature_1_m.abs().max(f64::MIN_POSITIVE);
+            let slope_1_m2 = sample
+                .path
+                .curvature_slope_1_m2
+                .abs()
+                .max(f64::MIN_POSITIVE);
             let square = (bounds.lateral_m_s2 / bend_1_m).min(bounds.yaw_rad_s2 / slope_1_m2);
-            let distance_m = there.arc_m - planned.arc_m;
+            let distance_m = sample.arc_m - planned.arc_m;
             energy = energy.min(0.5 * square + bounds.longitudinal_m_s2 * distance_m);
         }
         let turned = (HEADING_FULL_RAD - heading_rad.abs()) / (HEADING_FULL_RAD - HEADING_FREE_RAD);
@@ -273,12 +277,13 @@ impl Governor {
     pub fn step(&mut self, plan: &Plan, input: &GovernorInput, dt_s: f64) -> ReferenceSample {
         let planned = plan.sample(self.clock_s);
         let floor_m_s = planned.speed_m_s.max(SPEED_FLOOR_M_S);
-        let wait = input.rate_for_lag();
+        let lag_rate = input.rate_for_lag();
         let target = if self.stopping {
             0.0
         } else {
-            let followed = if input.saturated { SATURATED_RATE } else { 1.0 };
-            wait.min(followed)
+            let saturation_rate = if input.saturated { SATURATED_RATE } else { 1.0 };
+            lag_rate
+                .min(saturation_rate)
                 .min(self.rate_cap)
                 .min(self.rate_within_speed_limit(plan))
                 .min(self.rate_on_sliding_ground(plan, &planned))

@@ -24,7 +24,7 @@ pub struct Slowing {
 pub struct Change<T> {
     /// The present command.
     pub from: T,
-    /// The wanted command.
+    /// The requested command.
     pub to: T,
 }
 
@@ -81,9 +81,9 @@ impl TwistLimits {
 
     /// Returns the command after `dt_s` seconds of a change: v and ω speed up within the
     /// acceleration limits, slow down within `slowing`, and every wheel keeps its own limits. The
-    /// wanted twist is not passed.
+    /// requested twist is not passed.
     ///
-    /// Both twists must be finite and the wanted one within the speed limits. If the present one is
+    /// Both twists must be finite and the requested one within the speed limits. If the present one is
     /// within the speed limits, the result is too.
     pub fn step(&self, change: Change<Twist>, slowing: Slowing, dt_s: f64) -> Twist {
         let limits = self.model.limits();
@@ -203,14 +203,14 @@ mod tests {
             let next = limits.step(Change { from, to }, limits.slowing_by_wheels(), dt_s);
             let linear = model.limits().linear_acceleration_max_m_s2 * dt_s;
             let angular = model.angular_acceleration_max_rad_s2() * dt_s;
-            for (before, after, wanted, most) in [
+            for (before, after, requested, most) in [
                 (from.linear_m_s, next.linear_m_s, to.linear_m_s, linear),
                 (from.angular_rad_s, next.angular_rad_s, to.angular_rad_s, angular),
             ] {
                 prop_assert!(after.abs() <= before.abs() + most + 1.0e-12);
                 prop_assert!(before * after >= 0.0 || after.abs() <= most + 1.0e-12);
-                prop_assert!(after >= before.min(wanted) - 1.0e-12);
-                prop_assert!(after <= before.max(wanted) + 1.0e-12);
+                prop_assert!(after >= before.min(requested) - 1.0e-12);
+                prop_assert!(after <= before.max(requested) + 1.0e-12);
             }
             prop_assert!(limits.share_within(next) > 1.0 - 1.0e-9);
         }

@@ -168,7 +168,7 @@ impl Agent {
             telemetry: telemetry.clone(),
         });
         let (connected, is_connected) = watch::channel(false);
-        let (heard, membership) = renew_membership(&supervisor, &config, &dispatcher.clock);
+        let (server_trust, membership) = renew_membership(&supervisor, &config, &dispatcher.clock);
         let online = Online {
             config,
             identity: identity.clone(),
@@ -178,7 +178,7 @@ impl Agent {
             stop: supervisor.stop_token(),
             connected,
             membership,
-            heard,
+            server_trust,
         };
         supervisor.spawn("fleet link", online.run());
         info!(robot.id = %identity.robot, %boot, "agent of `{}` runs", identity.robot);
@@ -223,16 +223,16 @@ fn loop_core(
         return Ok((core, None));
     };
     let writer = RecordWriter::new(to, head, model, Arc::clone(clock));
-    let (taker, notes) = notes();
+    let (record_sender, notes) = notes();
     let writing = supervisor.spawn_thread(part, move || writer.run(&notes));
     let writing = writing.map_err(|source| StartError::Thread { part, source })?;
-    core.record_to(Some(taker));
+    core.record_to(Some(record_sender));
     Ok((core, Some(writing)))
 }
 
 /// The server's statements on trusted authorities, and the certificate, which changes with each
 /// renewal.
-type Renewing = (
+type MembershipRenewal = (
     watch::Sender<ServerTrust>,
     Option<watch::Receiver<Arc<Membership>>>,
 );
@@ -242,20 +242,20 @@ fn renew_membership(
     supervisor: &Supervisor,
     config: &AgentConfig,
     clock: &SharedClock,
-) -> Renewing {
-    let heard = watch::Sender::default();
+) -> MembershipRenewal {
+    let server_trust = watch::Sender::default();
     let Some(joined) = config.membership.clone() else {
-        return (heard, None);
+        return (server_trust, None);
     };
     let (present, membership) = watch::channel(Arc::new(joined));
     let renewal = Renewal {
         folder: config.data_dir.clone(),
         clock: Arc::clone(clock),
         present,
-        heard: heard.clone(),
+        server_trust: server_trust.clone(),
     };
     supervisor.spawn("renewal", renewal.run(supervisor.stop_token()));
-    (heard, Some(membership))
+    (server_trust, Some(membership))
 }
 
 impl RunningAgent {
@@ -291,19 +291,19 @@ impl RunningAgent {
     /// # Errors
     /// The thread for it cannot be started.
     pub fn notify_service_manager(&mut self) -> Result<(), StartError> {
-        if !service_manager::is_there() {
+        if !service_manager::is_present() {
             return Ok(());
         }
-        let teller = NotifierInputs {
+        let notifier = NotifierInputs {
             identity: self.identity.clone(),
             shared: Arc::clone(&self.shared),
             clock: Arc::clone(&self.reporter.clock),
             has_connected: self.is_connected.clone(),
         };
         let part = "service manager";
-        let telling = self.supervisor.spawn_thread(part, move || teller.run());
+        let notifying = self.supervisor.spawn_thread(part, move || notifier.run());
         let no_thread = move |source| StartError::Thread { part, source };
-        self.threads.push(telling.map_err(no_thread)?);
+        self.threads.push(notifying.map_err(no_thread)?);
         Ok(())
     }
 

@@ -59,7 +59,7 @@ const RESUME_WITHIN_M: f64 = 0.5;
 /// Longest wait for the loop to hold a mission for its next revision.
 const HOLD_WAIT_MAX: Duration = Duration::from_secs(5);
 /// Interval of the checks of the loop's snapshot.
-const HOLD_LOOK_EVERY: Duration = Duration::from_millis(5);
+const HOLD_POLL_EVERY: Duration = Duration::from_millis(5);
 /// Speed of a reference up to which it counts as stopped, m/s.
 const STANDS_M_S: f64 = 0.02;
 
@@ -175,23 +175,23 @@ impl Dispatcher {
                 self.answer(command, limit).await;
             }
             Verb::StateRate => {
-                let rate = async |asked| self.publish_rate.request(asked);
+                let rate = async |request| self.publish_rate.request(request);
                 self.answer(command, rate).await;
             }
             Verb::Outcomes => {
-                let outcomes = async |asked| self.outcomes(&asked);
+                let outcomes = async |request| self.outcomes(&request);
                 self.answer(command, outcomes).await;
             }
         }
     }
 
-    fn outcomes(&self, asked: &Outcomes) -> Result<MissionOutcomes, CommandRefusal> {
-        let count = asked.missions.len();
+    fn outcomes(&self, request: &Outcomes) -> Result<MissionOutcomes, CommandRefusal> {
+        let count = request.missions.len();
         if count > OUTCOMES_MAX {
             let detail = format!("{count} missions; at most {OUTCOMES_MAX} are possible");
             return refused(CommandRefusalCode::TooMany, detail);
         }
-        Ok(self.missions.slot().outcomes(&asked.missions))
+        Ok(self.missions.slot().outcomes(&request.missions))
     }
 
     /// Decodes a command, decides on it and answers.
@@ -204,7 +204,7 @@ impl Dispatcher {
         C::Reply: From<Result<T, CommandRefusal>>,
     {
         match wire::decode(&command.payload) {
-            Ok(asked) => self.reply::<C, T>(command, decide(asked).await).await,
+            Ok(request) => self.reply::<C, T>(command, decide(request).await).await,
             Err(cause) => self.refuse(command, &cause).await,
         }
     }
@@ -450,7 +450,7 @@ impl Dispatcher {
                     let is_moving = speed_m_s > STANDS_M_S;
                     return Some((is_moving.then_some(governor), measured));
                 }
-                tokio::time::sleep(HOLD_LOOK_EVERY).await;
+                tokio::time::sleep(HOLD_POLL_EVERY).await;
             }
         };
         let is_known = driving.mission == mission;
@@ -459,8 +459,8 @@ impl Dispatcher {
         let Some(governor) = moving else {
             return Some(measured);
         };
-        let foretelling = tokio::task::spawn_blocking(move || governor.rest(&driving.plan));
-        foretelling.await.ok()
+        let computing_rest = tokio::task::spawn_blocking(move || governor.rest(&driving.plan));
+        computing_rest.await.ok()
     }
 
     async fn cancel(&self, cancel: Cancel) -> Result<(), CommandRefusal> {

@@ -117,8 +117,8 @@ pub fn paper_robot() -> robot::RobotModel {
 }
 
 /// Converts a requested trajectory to the controller's.
-pub fn control_trajectory(asked: &trajectory::Trajectory) -> planned::Trajectory {
-    match asked {
+pub fn control_trajectory(requested: &trajectory::Trajectory) -> planned::Trajectory {
+    match requested {
         trajectory::Trajectory::Circle(circle) => {
             planned::Trajectory::Circle(planned::CircleSpec {
                 center: control_point(circle.center),
@@ -146,8 +146,8 @@ pub fn control_trajectory(asked: &trajectory::Trajectory) -> planned::Trajectory
 }
 
 /// Converts the options of a requested trajectory to the controller's.
-pub fn plan_options(asked: &trajectory::Trajectory) -> PlanOptions<'static> {
-    let options = asked.options();
+pub fn plan_options(requested: &trajectory::Trajectory) -> PlanOptions<'static> {
+    let options = requested.options();
     PlanOptions {
         approach_speed_m_s: options.approach_speed_m_s,
         excitation: options.excitation.map(|excitation| ExcitationSpec {

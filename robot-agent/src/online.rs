@@ -29,7 +29,7 @@ use crate::outbox::Outbox;
 use crate::reporter::{Reporter, every, publish_states};
 
 /// Time for the last state to be sent before the session closes.
-const LAST_WORD_WAIT: Duration = Duration::from_millis(100);
+const LAST_STATE_WAIT: Duration = Duration::from_millis(100);
 
 /// Difference between the robot's clock and the server's from which it is logged: that from which
 /// the server raises an alert.
@@ -41,7 +41,7 @@ const LINK_FAILED_REST: Duration = Duration::from_secs(1);
 /// its router takes less.
 const LOST_GRACE: Duration = Duration::from_millis(300);
 /// Interval between two looks at the silence of the server.
-const SILENCE_LOOK_EVERY: Duration = Duration::from_millis(50);
+const SILENCE_POLL_EVERY: Duration = Duration::from_millis(50);
 
 /// Waits for the next certificate; never returns without a membership.
 async fn renewed(membership: &mut Option<watch::Receiver<Arc<Membership>>>) {
@@ -65,7 +65,7 @@ pub(crate) struct Online {
     /// Certificate, which changes with each renewal; `None` for a robot without one.
     pub(crate) membership: Option<watch::Receiver<Arc<Membership>>>,
     /// The server's statements on the authorities that robots shall trust.
-    pub(crate) heard: watch::Sender<ServerTrust>,
+    pub(crate) server_trust: watch::Sender<ServerTrust>,
 }
 
 /// What lasts from link to link.
@@ -74,15 +74,15 @@ struct Links {
     listeners: Listeners,
     membership: Option<watch::Receiver<Arc<Membership>>>,
     /// The certificate of the attempt before.
-    shown: Option<Arc<Membership>>,
+    presented: Option<Arc<Membership>>,
     /// Whether the present link has broken and no server has been heard since.
     is_lost: Arc<AtomicBool>,
     /// Links to servers that were left, while they are closed.
     closing: JoinSet<()>,
 }
 
-fn set_trust(heard: &watch::Sender<ServerTrust>, trust: ServerTrust) {
-    heard.send_if_modified(|present| std::mem::replace(present, trust) != trust);
+fn set_trust(server_trust: &watch::Sender<ServerTrust>, trust: ServerTrust) {
+    server_trust.send_if_modified(|present| std::mem::replace(present, trust) != trust);
 }
 
 impl Online {
@@ -90,12 +90,12 @@ impl Online {
     pub(crate) async fn run(mut self) {
         let (shared, clock) = (&self.dispatcher.shared, &self.dispatcher.clock);
         let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
-        let heard = self.heard.clone();
+        let server_trust = self.server_trust.clone();
         let publish_rate = Arc::clone(&self.reporter.publish_rate);
         let is_lost = Arc::new(AtomicBool::new(false));
         let lost = Arc::clone(&is_lost);
         let on_event: LinkEventHandler = Arc::new(move |event| match event {
-            LinkEvent::ServerHeard => {
+            LinkEvent::ServerMessage => {
                 lost.store(false, Ordering::Relaxed);
                 shared.record_server_message(clock.monotonic());
             }
@@ -104,8 +104,8 @@ impl Online {
                 lost.store(true, Ordering::Relaxed);
                 publish_rate.end_request();
             }
-            LinkEvent::Trust(trust) => set_trust(&heard, ServerTrust::Is(trust)),
-            LinkEvent::Distrusted => set_trust(&heard, ServerTrust::Distrusted),
+            LinkEvent::Trust(trust) => set_trust(&server_trust, ServerTrust::Is(trust)),
+            LinkEvent::Distrusted => set_trust(&server_trust, ServerTrust::Distrusted),
         });
         tokio::select! {
             // Spreads the connections of robots that are switched on together.
@@ -126,7 +126,7 @@ impl Online {
             servers: Rotation::new(self.config.servers.endpoints()),
             listeners,
             membership: self.membership.take(),
-            shown: None,
+            presented: None,
             is_lost,
             closing: JoinSet::new(),
         };
@@ -141,14 +141,14 @@ impl Online {
         self.reporter.publish_rate.end_request();
         let began = self.dispatcher.clock.monotonic();
         let membership = &mut links.membership;
-        let shown = membership
+        let presented = membership
             .as_mut()
             .map(|it| Arc::clone(&it.borrow_and_update()));
-        let before = std::mem::replace(&mut links.shown, shown.clone());
-        if before.as_ref().map(Arc::as_ptr) != shown.as_ref().map(Arc::as_ptr) {
+        let before = std::mem::replace(&mut links.presented, presented.clone());
+        if before.as_ref().map(Arc::as_ptr) != presented.as_ref().map(Arc::as_ptr) {
             links.servers.reset_failures();
         }
-        let connecting = self.connect(&mut links.servers, shown.as_deref(), &links.listeners);
+        let connecting = self.connect(&mut links.servers, presented.as_deref(), &links.listeners);
         let connected = tokio::select! {
             connected = connecting => connected,
             () = self.stop.cancelled() => return ControlFlow::Break(()),
@@ -285,7 +285,7 @@ impl Online {
         let clock = &self.dispatcher.clock;
         let begun = clock.monotonic();
         loop {
-            tokio::time::sleep(SILENCE_LOOK_EVERY).await;
+            tokio::time::sleep(SILENCE_POLL_EVERY).await;
             let now = clock.monotonic();
             let silence = self.dispatcher.shared.server_silence(now);
             let silence = silence.min(now.saturating_sub(begun));
@@ -303,7 +303,7 @@ impl Online {
         let mut last = self.reporter.state();
         last.leaving = true;
         link.publish_state(&last);
-        tokio::time::sleep(LAST_WORD_WAIT).await;
+        tokio::time::sleep(LAST_STATE_WAIT).await;
     }
 
     /// Sends the introduction on every new connection until it is answered.

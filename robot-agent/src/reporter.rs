@@ -32,7 +32,7 @@ use crate::state_rate::{PublishRate, PublishTimes};
 /// Longest wait for the loop before a change is published: two ticks of the slowest loop.
 const TICK_WAIT_MAX: Duration = Duration::from_millis(100);
 /// Interval of the checks of the loop's ticks, and the shortest time between two published changes.
-const TICK_LOOK_EVERY: Duration = Duration::from_millis(2);
+const TICK_POLL_EVERY: Duration = Duration::from_millis(2);
 
 /// Builds and publishes the robot's state.
 #[derive(Debug)]
@@ -190,13 +190,13 @@ impl Reporter {
     }
 
     /// Waits until the loop has processed a recent change, so that the published mode includes it.
-    async fn loop_has_seen(&self) {
+    async fn await_loop_update(&self) {
         let ticks = || self.shared.ticks.load(Ordering::Relaxed);
         // A tick that has begun may not have read the change.
         let seen = ticks() + 2;
         let ticking = async {
             while ticks() < seen {
-                tokio::time::sleep(TICK_LOOK_EVERY).await;
+                tokio::time::sleep(TICK_POLL_EVERY).await;
             }
         };
         // If the loop does not tick, its last snapshot is published.
@@ -239,12 +239,12 @@ pub(crate) async fn log_losses(
     base: Option<Arc<Counts>>,
     stop: CancellationToken,
 ) {
-    let (mut drop_monitor, mut said) = (DropMonitor::default(), None);
+    let (mut drop_monitor, mut logged_drops) = (DropMonitor::default(), None);
     let (mut segments, mut blocks) = (0, 0);
     let mut recent_notices = [RecentNotices::default(); Notice::ALL.len()];
     let mut noticed = [const { None }; Notice::ALL.len()];
-    let (mut foreign, mut foreign_said) = (ForeignCommands::default(), None);
-    let mut missing_said = None;
+    let (mut foreign, mut logged_foreign) = (ForeignCommands::default(), None);
+    let mut logged_missing = None;
     loop {
         tokio::select! {
             () = tokio::time::sleep(LOSSES_EVERY) => {}
@@ -252,10 +252,10 @@ pub(crate) async fn log_losses(
         }
         let dropped = base.as_deref().and_then(|base| drop_monitor.check(base));
         // The count in it grows as long as there is something new.
-        if let Some((_, text)) = dropped.as_ref().filter(|_| dropped != said) {
+        if let Some((_, text)) = dropped.as_ref().filter(|_| dropped != logged_drops) {
             warn!("{text}");
         }
-        said = dropped;
+        logged_drops = dropped;
         if let Some(base) = base.as_deref() {
             for notice in Notice::ALL {
                 let text = recent_notices[notice as usize].check(base, notice);
@@ -265,15 +265,15 @@ pub(crate) async fn log_losses(
                 }
             }
             let text = foreign.check(base);
-            if let Some(text) = text.as_ref().filter(|_| text != foreign_said) {
+            if let Some(text) = text.as_ref().filter(|_| text != logged_foreign) {
                 warn!("{text}");
             }
-            foreign_said = text;
+            logged_foreign = text;
             let text = base.topics_without_messages(&Source::CONTINUOUS);
-            if let Some(text) = text.as_ref().filter(|_| text != missing_said) {
+            if let Some(text) = text.as_ref().filter(|_| text != logged_missing) {
                 warn!("{text}: does a node publish it under this name? (`tread-agent doctor`)");
             }
-            missing_said = text;
+            logged_missing = text;
         }
         let lost = shared.lost_segments.load(Ordering::Relaxed);
         if lost > segments {
@@ -302,7 +302,7 @@ pub(crate) async fn publish_states(link: Arc<FleetLink>, reporter: &Reporter) {
     loop {
         tokio::select! {
             () = times.next() => {}
-            () = reporter.safety.changed() => reporter.loop_has_seen().await,
+            () = reporter.safety.changed() => reporter.await_loop_update().await,
         }
         link.publish_state(&reporter.state());
     }

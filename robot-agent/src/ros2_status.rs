@@ -22,7 +22,7 @@ use crate::drive::ros2::settings::OutwardSettings;
 use crate::recording::views::{PATH_POINTS_MAX, header, path, poses_of, state};
 
 /// Interval of the messages.
-const SAY_EVERY: Duration = Duration::from_secs(1);
+const PUBLISH_PERIOD: Duration = Duration::from_secs(1);
 /// Silence of the server from which the diagnostics have the level of a warning.
 const SILENT_SERVER: Duration = Duration::from_secs(5);
 /// Distance between two points of the driven path, metres.
@@ -47,7 +47,7 @@ pub(crate) struct AgentStatePublisher {
     counts: Arc<Counts>,
     robot: String,
     /// Time of the last messages, by the agent's monotonic clock.
-    said: Option<Duration>,
+    published_at: Option<Duration>,
     /// Mission and revision of the published plan.
     mission: Option<(MissionId, u32)>,
     /// Poses of the plan, in the frame of the settings, as those of `driven`.
@@ -60,25 +60,30 @@ pub(crate) struct AgentStatePublisher {
 }
 
 impl StatePublisher for AgentStatePublisher {
-    fn step(&mut self, now: Duration, wall_ns: i64, say: &mut dyn FnMut(PublishedTopic, &[u8])) {
+    fn step(
+        &mut self,
+        now: Duration,
+        wall_ns: i64,
+        publish: &mut dyn FnMut(PublishedTopic, &[u8]),
+    ) {
         let snapshot = self.shared.snapshot();
         let is_new = self.update_mission(&snapshot);
         self.update_place(&snapshot);
-        let is_due = |said: Duration| now.saturating_sub(said) >= SAY_EVERY;
-        if !is_new && !self.said.is_none_or(is_due) {
+        let is_due = |published_at: Duration| now.saturating_sub(published_at) >= PUBLISH_PERIOD;
+        if !is_new && !self.published_at.is_none_or(is_due) {
             return;
         }
-        self.said = Some(now);
+        self.published_at = Some(now);
         let (frame, mut bytes) = (self.settings.frame.as_str(), Vec::new());
         path(&self.plan, frame, wall_ns, &mut bytes);
-        say(PublishedTopic::Plan, &bytes);
+        publish(PublishedTopic::Plan, &bytes);
         path(&self.driven, frame, wall_ns, &mut bytes);
-        say(PublishedTopic::Driven, &bytes);
+        publish(PublishedTopic::Driven, &bytes);
         theta(&snapshot, &mut bytes);
-        say(PublishedTopic::Theta, &bytes);
+        publish(PublishedTopic::Theta, &bytes);
         let parts = self.parts(now, &snapshot);
         diagnostics(&parts, &self.robot, wall_ns, &mut bytes);
-        say(PublishedTopic::Diagnostics, &bytes);
+        publish(PublishedTopic::Diagnostics, &bytes);
     }
 }
 
@@ -94,7 +99,7 @@ impl AgentStatePublisher {
             shared,
             counts,
             robot,
-            said: None,
+            published_at: None,
             mission: None,
             plan: Vec::new(),
             driven: Vec::with_capacity(PATH_POINTS_MAX as usize),
@@ -197,8 +202,8 @@ fn control(snapshot: &Snapshot) -> Part {
     ];
     if let Some(mission) = snapshot.mission {
         values.push(("mission".to_owned(), mission.id.to_string()));
-        let way = format!("{:.2} of {:.2}", mission.driven_m, mission.length_m);
-        values.push(("driven, m".to_owned(), way));
+        let progress = format!("{:.2} of {:.2}", mission.driven_m, mission.length_m);
+        values.push(("driven, m".to_owned(), progress));
         let off = format!("{:.3}", mission.cross_track_m);
         values.push(("cross-track error, m".to_owned(), off));
     }

@@ -32,11 +32,11 @@ use crate::fleet::Identity;
 /// Messages to the watchdog in the time that it waits for one: some may be late.
 const MESSAGES_PER_TIMEOUT: u32 = 4;
 /// Checks of the loop for each message.
-const LOOKS_PER_MESSAGE: u32 = 4;
+const POLLS_PER_MESSAGE: u32 = 4;
 /// Longest interval between two checks.
-const LOOK_EVERY_MAX: Duration = Duration::from_millis(100);
+const POLL_EVERY_MAX: Duration = Duration::from_millis(100);
 /// Shortest interval between two checks.
-const LOOK_EVERY_MIN: Duration = Duration::from_millis(5);
+const POLL_EVERY_MIN: Duration = Duration::from_millis(5);
 
 /// Decides when the watchdog is fed. Pure.
 #[derive(Debug, Clone, Copy)]
@@ -58,7 +58,7 @@ impl Feeding {
     }
 }
 
-/// What is read to tell the service manager.
+/// State from which the messages to the service manager are made.
 #[derive(Debug)]
 pub(crate) struct NotifierInputs {
     pub(crate) identity: Identity,
@@ -68,7 +68,7 @@ pub(crate) struct NotifierInputs {
 }
 
 /// Returns whether a service manager waits for messages.
-pub(crate) fn is_there() -> bool {
+pub(crate) fn is_present() -> bool {
     std::env::var_os("NOTIFY_SOCKET").is_some()
 }
 
@@ -99,25 +99,25 @@ impl NotifierInputs {
     /// Tells the service manager until the loop is requested to stop.
     pub(crate) fn run(self) {
         let timeout = sd_notify::watchdog_enabled();
-        let look_every = timeout.map_or(LOOK_EVERY_MAX, |timeout| {
-            let look_every = timeout / (MESSAGES_PER_TIMEOUT * LOOKS_PER_MESSAGE);
-            look_every.clamp(LOOK_EVERY_MIN, LOOK_EVERY_MAX)
+        let poll_every = timeout.map_or(POLL_EVERY_MAX, |timeout| {
+            let poll_every = timeout / (MESSAGES_PER_TIMEOUT * POLLS_PER_MESSAGE);
+            poll_every.clamp(POLL_EVERY_MIN, POLL_EVERY_MAX)
         });
         let mut feeding = timeout.map(|timeout| Feeding {
             every: timeout / MESSAGES_PER_TIMEOUT,
             ticks: 0,
             at: self.clock.monotonic(),
         });
-        let mut said = None;
+        let mut sent_status = None;
         while !self.shared.stop.load(Ordering::Relaxed) {
-            std::thread::sleep(look_every);
+            std::thread::sleep(poll_every);
             let ticks = self.shared.ticks.load(Ordering::Relaxed);
             if ticks == 0 {
                 continue;
             }
             let status = self.status();
             let mut messages = Vec::new();
-            if said.is_none() {
+            if sent_status.is_none() {
                 messages.push(NotifyState::Ready);
             }
             let now = self.clock.monotonic();
@@ -127,13 +127,13 @@ impl NotifierInputs {
             {
                 messages.push(NotifyState::Watchdog);
             }
-            if said.as_ref() != Some(&status) {
+            if sent_status.as_ref() != Some(&status) {
                 messages.push(NotifyState::Status(&status));
             }
             if !messages.is_empty() {
                 notify(&messages);
             }
-            said = Some(status);
+            sent_status = Some(status);
         }
         notify(&[NotifyState::Stopping, NotifyState::Status("stopping")]);
     }

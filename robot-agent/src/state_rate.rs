@@ -49,18 +49,18 @@ impl PublishRate {
     ///
     /// # Errors
     /// [`CommandRefusalCode::Impossible`] for a rate that is not finite or not above 0.
-    pub(crate) fn request(&self, asked: StateRate) -> Result<(), CommandRefusal> {
-        self.request_at(asked, Instant::now())
+    pub(crate) fn request(&self, request: StateRate) -> Result<(), CommandRefusal> {
+        self.request_at(request, Instant::now())
     }
 
-    fn request_at(&self, asked: StateRate, now: Instant) -> Result<(), CommandRefusal> {
-        asked
+    fn request_at(&self, request: StateRate, now: Instant) -> Result<(), CommandRefusal> {
+        request
             .validate()
             .map_err(|detail| CommandRefusal::new(CommandRefusalCode::Impossible, detail))?;
         let before_hz = self.rate_hz(now);
-        let lasting = Duration::from_millis(asked.for_ms.min(STATE_RATE_FOR_MAX_MS));
+        let lasting = Duration::from_millis(request.for_ms.min(STATE_RATE_FOR_MAX_MS));
         *self.lock() = Some(Requested {
-            rate_hz: asked.rate_hz.min(STATE_RATE_MAX_HZ).max(self.own_hz),
+            rate_hz: request.rate_hz.min(STATE_RATE_MAX_HZ).max(self.own_hz),
             until: now + lasting,
         });
         if self.rate_hz(now) > before_hz {

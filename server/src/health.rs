@@ -28,10 +28,11 @@ pub(crate) struct HealthArgs {
     ready: bool,
 }
 
-/// Asks the server on this machine for `/healthz`, or `/readyz`.
+/// Requests `/healthz`, or `/readyz`, from the server on this machine.
 ///
 /// # Errors
-/// The configuration is invalid, nobody answers in time, or the answer is another one.
+/// The configuration is invalid, no answer arrives in time, or the answer is not that of a healthy
+/// server.
 pub(crate) async fn run(args: HealthArgs) -> anyhow::Result<()> {
     let config = Config::load(&ServerArgs {
         config: args.config,
@@ -81,14 +82,14 @@ mod tests {
 
     #[test]
     fn a_server_that_listens_everywhere_is_asked_on_the_loopback() {
-        for (listens, asked) in [
+        for (listens, expected) in [
             ("0.0.0.0:8420", "127.0.0.1:8420"),
             ("[::]:8420", "[::1]:8420"),
             ("192.0.2.7:80", "192.0.2.7:80"),
         ] {
             assert_eq!(
                 reachable(listens.parse().unwrap()),
-                asked.parse().unwrap(),
+                expected.parse().unwrap(),
                 "{listens}"
             );
         }

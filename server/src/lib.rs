@@ -135,20 +135,21 @@ impl Server {
     /// # Errors
     /// As [`Server::start`].
     pub async fn start_until(
-        asked: impl Future<Output = ()>,
+        stop_requested: impl Future<Output = ()>,
         mut config: Config,
         clock: Clock,
         resolver: Arc<dyn Resolver>,
     ) -> anyhow::Result<Option<RunningServer>> {
         config.check_credentials()?;
-        let mut asked = pin!(asked);
-        let Some(taken) = standby::acquire_lock(asked.as_mut(), &config, &clock).await? else {
+        let mut stop_requested = pin!(stop_requested);
+        let Some(taken) = standby::acquire_lock(stop_requested.as_mut(), &config, &clock).await?
+        else {
             return Ok(None);
         };
         let starting = Box::pin(Self::start_locked(taken, config, clock, resolver));
         tokio::select! {
             started = starting => started.map(Some),
-            () = asked => Ok(None),
+            () = stop_requested => Ok(None),
         }
     }
 
@@ -217,11 +218,11 @@ impl Server {
         fleet.listen(&app, uploads, republish_at).await?;
         supervisor.spawn_vital("reconciler", reconciler::run(app.clone(), stop()));
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
-        let asking = app::watched::run(app.clone(), stop());
-        supervisor.spawn_vital("watched robots", asking);
+        let watching_robots = app::watched::run(app.clone(), stop());
+        supervisor.spawn_vital("watched robots", watching_robots);
         spawn_database_tasks(&app, config.retention, &supervisor);
-        let telling = app::friction::live::run(app.clone(), stop());
-        supervisor.spawn_vital("map", telling);
+        let sending_map = app::friction::live::run(app.clone(), stop());
+        supervisor.spawn_vital("map", sending_map);
         spawn_identity_tasks(&app, &supervisor);
         let backing_up = backups::run(app.clone(), schedule, stop());
         supervisor.spawn_vital("backups", backing_up);
@@ -458,12 +459,12 @@ impl RunningServer {
     /// Tells the service manager that started this process, if any, that the server is ready, and
     /// from then on that it lives, until the stop.
     fn notify_service_manager(&self) {
-        if service_manager::is_there() {
+        if service_manager::is_present() {
             let address = format!("{}://{}", self.scheme, self.http_address);
             let (supervisor, app) = (&self.supervisor, self.app.clone());
             let (liveness, stop) = (supervisor.liveness(), supervisor.stop_token());
-            let telling = service_manager::run(app, address, liveness, stop);
-            supervisor.spawn_vital("service manager", telling);
+            let notifying = service_manager::run(app, address, liveness, stop);
+            supervisor.spawn_vital("service manager", notifying);
         }
     }
 

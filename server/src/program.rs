@@ -158,7 +158,7 @@ pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
         let mut interrupt = signal(SignalKind::interrupt())?;
         let ignores_hangup = ignores_hangup();
         let mut hangup = signal(SignalKind::hangup())?;
-        let mut asked = async || {
+        let mut stop_requested = async || {
             tokio::select! {
                 _ = terminate.recv() => info!("asked to stop"),
                 _ = interrupt.recv() => info!("asked to stop"),
@@ -167,13 +167,13 @@ pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
         };
         // A standby may wait for long.
         let (clock, resolver) = (Clock::system(), Arc::new(SystemResolver));
-        let started = Server::start_until(asked(), config, clock, resolver).await?;
+        let started = Server::start_until(stop_requested(), config, clock, resolver).await?;
         let Some(server) = started else {
             return Ok(());
         };
         server.notify_service_manager();
         tokio::select! {
-            () = asked() => {}
+            () = stop_requested() => {}
             () = server.failed() => {}
         }
         server.stop().await

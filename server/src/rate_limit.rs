@@ -35,8 +35,8 @@ pub(crate) struct Bucket {
 impl Bucket {
     /// Returns the time until the next event is allowed.
     fn delay(self, limit: RateLimit, now: Duration) -> Duration {
-        let owed = self.full_at.saturating_sub(now) + limit.interval;
-        owed.saturating_sub(limit.interval * limit.burst)
+        let backlog = self.full_at.saturating_sub(now) + limit.interval;
+        backlog.saturating_sub(limit.interval * limit.burst)
     }
 
     /// Returns whether an event is allowed now.
@@ -66,9 +66,9 @@ impl Bucket {
     /// Counts `count` events that have taken place, also beyond the limit. Returns the time until
     /// the limit is met again.
     pub(crate) fn charge(&mut self, limit: RateLimit, now: Duration, count: u32) -> Duration {
-        let owed = self.full_at.saturating_sub(now) + limit.interval * count;
-        self.full_at = now + owed;
-        owed.saturating_sub(limit.interval * limit.burst)
+        let backlog = self.full_at.saturating_sub(now) + limit.interval * count;
+        self.full_at = now + backlog;
+        backlog.saturating_sub(limit.interval * limit.burst)
     }
 
     /// Returns whether the limit is unused at `now`.

@@ -54,7 +54,7 @@ fn send(messages: &[NotifyState<'_>]) -> io::Result<()> {
 }
 
 /// Returns whether a service manager waits for messages.
-pub(crate) fn is_there() -> bool {
+pub(crate) fn is_present() -> bool {
     std::env::var_os("NOTIFY_SOCKET").is_some()
 }
 
@@ -75,8 +75,8 @@ fn status(app: &App, address: &str) -> String {
 pub(crate) async fn run(app: App, address: String, liveness: Liveness, stop: CancellationToken) {
     let watchdog = sd_notify::watchdog_enabled();
     let every = watchdog.map_or(STATUS_EVERY, |timeout| timeout / MESSAGES_PER_TIMEOUT);
-    let mut said = status(&app, &address);
-    notify(&[NotifyState::Ready, NotifyState::Status(&said)]);
+    let mut sent_status = status(&app, &address);
+    notify(&[NotifyState::Ready, NotifyState::Status(&sent_status)]);
     let mut blocked = None;
     loop {
         let now_blocked = liveness.begin_round();
@@ -92,9 +92,9 @@ pub(crate) async fn run(app: App, address: String, liveness: Liveness, stop: Can
             () = tokio::time::sleep(every) => {}
         }
         let present = status(&app, &address);
-        if present != said {
-            said = present;
-            notify(&[NotifyState::Status(&said)]);
+        if present != sent_status {
+            sent_status = present;
+            notify(&[NotifyState::Status(&sent_status)]);
         }
     }
     notify(&[NotifyState::Stopping, NotifyState::Status("stopping")]);

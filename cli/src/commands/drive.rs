@@ -120,13 +120,13 @@ fn key_effect(key: KeyEvent) -> KeyEffect {
 #[derive(Debug, Clone, Copy, Default)]
 struct Keys {
     linear: Option<(f64, Instant)>,
-    around: Option<(f64, Instant)>,
+    angular: Option<(f64, Instant)>,
 }
 
 impl Keys {
-    fn press(&mut self, (linear, around): (f64, f64), now: Instant) {
+    fn press(&mut self, (linear, angular): (f64, f64), now: Instant) {
         if linear == 0.0 {
-            self.around = Some((around, now));
+            self.angular = Some((angular, now));
         } else {
             self.linear = Some((linear, now));
         }
@@ -137,7 +137,7 @@ impl Keys {
             let held = key.filter(|(_, at)| now.saturating_duration_since(*at) < KEY_HOLDS);
             held.map_or(0.0, |(share, _)| share)
         };
-        (share(self.linear), share(self.around))
+        (share(self.linear), share(self.angular))
     }
 }
 
@@ -149,12 +149,12 @@ pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::
     let driver = DriverName {
         name: arguments.name.clone(),
     };
-    let wanted = if arguments.take {
+    let request = if arguments.take {
         DriveRequest::Take(driver)
     } else {
         DriveRequest::Acquire(driver)
     };
-    send(&mut socket, &wanted).await?;
+    send(&mut socket, &request).await?;
     line(HELP)?;
     let mut signals = ShutdownSignals::listen()?;
     let terminal = RawTerminal::enter()?;
@@ -248,7 +248,7 @@ impl Driving<'_> {
     /// Handles a key; returns false to quit.
     async fn press(&mut self, socket: &mut Socket, key: KeyEvent) -> anyhow::Result<bool> {
         match key_effect(key) {
-            KeyEffect::Move(linear, around) => self.keys.press((linear, around), Instant::now()),
+            KeyEffect::Move(linear, angular) => self.keys.press((linear, angular), Instant::now()),
             KeyEffect::Stop => {
                 self.keys = Keys::default();
                 let words = StopReason {
@@ -267,10 +267,10 @@ impl Driving<'_> {
         if !self.has_lease {
             return Ok(());
         }
-        let (linear, around) = self.keys.shares(Instant::now());
+        let (linear, angular) = self.keys.shares(Instant::now());
         let drive = Drive {
             linear_m_s: linear * self.arguments.speed,
-            angular_rad_s: around * self.arguments.turn,
+            angular_rad_s: angular * self.arguments.turn,
             for_ms: Some(FOR_MS),
         };
         send(socket, &DriveRequest::Drive(drive)).await

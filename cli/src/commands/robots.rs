@@ -291,7 +291,7 @@ fn parameters(live: &RobotLive) -> Vec<String> {
 
 /// Returns the progress of a mission in whole steps, 0 to `steps`; `None` while its length is
 /// unknown.
-pub(super) fn steps_come(progress: MissionProgress, steps: usize) -> Option<usize> {
+pub(super) fn steps_driven(progress: MissionProgress, steps: usize) -> Option<usize> {
     let share = (progress.length_m > 0.0).then(|| progress.driven_m / progress.length_m)?;
     #[expect(
         clippy::cast_possible_truncation,

@@ -26,11 +26,11 @@ pub(super) async fn stop(
     } else {
         // Sent concurrently, so that no robot waits for another.
         let words = StopRobot { by, reason };
-        let asking = robots
+        let requests = robots
             .iter()
             .map(|robot| client.stop_robot(&connection.site, robot, &words));
         let (mut stops, mut failed) = (Vec::new(), None);
-        for answer in futures_util::future::join_all(asking).await {
+        for answer in futures_util::future::join_all(requests).await {
             match answer {
                 Ok(stop) => stops.push(stop),
                 Err(error) => failed = Some(error),

@@ -11,50 +11,50 @@ use tread_api::ids::MissionId;
 use tread_api::mission::{Mission, MissionState};
 
 use super::mission_text::{state, summary};
-use super::robots::steps_come;
+use super::robots::steps_driven;
 use crate::args::format_duration;
 use crate::client::Client;
 use crate::output::{Output, WaitTimeout, print_note};
 
 /// Polling period of the missions.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
+const POLL_EVERY: Duration = Duration::from_millis(250);
 /// Number of steps of a bar.
 const STEPS: usize = 1_000;
 
 /// Mission whose end is awaited.
-struct Waited {
+struct AwaitedMission {
     id: MissionId,
     bar: ProgressBar,
     /// Last printed state, where there are no bars.
-    said: Option<String>,
+    printed: Option<String>,
     ended: Option<Mission>,
 }
 
-impl Waited {
-    fn show(&mut self, seen: &Mission, lines: bool) {
+impl AwaitedMission {
+    fn show(&mut self, mission: &Mission, lines: bool) {
         if lines {
-            let state = state(seen);
-            if self.said.as_ref() != Some(&state) {
-                print_note(&summary(seen));
-                self.said = Some(state);
+            let state = state(mission);
+            if self.printed.as_ref() != Some(&state) {
+                print_note(&summary(mission));
+                self.printed = Some(state);
             }
             return;
         }
-        self.bar.set_prefix(seen.robot.to_string());
-        let come = seen
+        self.bar.set_prefix(mission.robot.to_string());
+        let steps = mission
             .progress
-            .and_then(|it| Some((it, steps_come(it, STEPS)?)));
-        let Some((progress, come)) = come else {
-            self.bar.set_message(state(seen));
+            .and_then(|it| Some((it, steps_driven(it, STEPS)?)));
+        let Some((progress, steps)) = steps else {
+            self.bar.set_message(state(mission));
             return;
         };
-        self.bar.set_position(come as u64);
+        self.bar.set_position(steps as u64);
         self.bar.set_message(format!(
             "{:.1} of {:.1} m, {:.0} mm off, {}",
             progress.driven_m,
             progress.length_m,
             1e3 * progress.cross_track_m.abs(),
-            state(seen)
+            state(mission)
         ));
     }
 }
@@ -81,14 +81,14 @@ pub(super) async fn wait(
         ProgressDrawTarget::hidden()
     });
     let style = ProgressStyle::with_template("{prefix:12} {bar:32} {msg}")?;
-    let mut waited: Vec<Waited> = missions
+    let mut waited: Vec<AwaitedMission> = missions
         .iter()
-        .map(|id| Waited {
+        .map(|id| AwaitedMission {
             id: *id,
             bar: all
                 .add(ProgressBar::new(STEPS as u64))
                 .with_style(style.clone()),
-            said: None,
+            printed: None,
             ended: None,
         })
         .collect();
@@ -99,13 +99,13 @@ pub(super) async fn wait(
             .filter(|waited| waited.ended.is_none())
             .map(|waited| waited.id)
             .collect();
-        let looks = open.iter().map(|id| client.mission(*id));
-        for detail in try_join_all(looks).await? {
+        let requests = open.iter().map(|id| client.mission(*id));
+        for detail in try_join_all(requests).await? {
             let seen = detail.mission;
-            let known = waited.iter_mut().find(|waited| waited.id == seen.id);
-            if let Some(known) = known {
-                known.show(&seen, lines);
-                known.ended = seen.state.is_terminal().then_some(seen);
+            let awaited = waited.iter_mut().find(|waited| waited.id == seen.id);
+            if let Some(awaited) = awaited {
+                awaited.show(&seen, lines);
+                awaited.ended = seen.state.is_terminal().then_some(seen);
             }
         }
         if waited.iter().all(|waited| waited.ended.is_some()) {
@@ -130,7 +130,7 @@ pub(super) async fn wait(
             );
             return Err(WaitTimeout(text).into());
         }
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_EVERY).await;
     }
 }
 

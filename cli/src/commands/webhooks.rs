@@ -13,9 +13,9 @@ use crate::client::{Client, ClientError};
 use crate::output::{Output, or_dash, print_note, render, table};
 
 /// Interval between looks at a test that is under way.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
+const POLL_EVERY: Duration = Duration::from_millis(250);
 /// Number of looks after which a test counts as not arrived: longer than an attempt takes.
-const LOOKS_MAX: u32 = 80;
+const POLLS_MAX: u32 = 80;
 
 pub(super) async fn run(
     arguments: WebhooksArguments,
@@ -120,14 +120,14 @@ async fn await_attempt(
     id: DeliveryId,
 ) -> anyhow::Result<Delivery> {
     let mut last = None;
-    for _ in 0..LOOKS_MAX {
+    for _ in 0..POLLS_MAX {
         let page = client.webhook_deliveries(webhook.id, PAGE_LIMIT_DEFAULT);
         let found = page.await?.items.into_iter().find(|one| one.id == id);
         match found {
             Some(delivery) if delivery.attempts > 0 => return Ok(delivery),
             found => last = found.or(last),
         }
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_EVERY).await;
     }
     last.context("the test is not in the log of deliveries")
 }

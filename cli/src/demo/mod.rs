@@ -36,7 +36,7 @@ const START_WAIT_MAX: Duration = Duration::from_secs(30);
 /// Maximum time for the last measurements to be uploaded after the last mission has ended.
 const UPLOAD_WAIT_MAX: Duration = Duration::from_secs(10);
 /// Polling period of the fleet.
-const LOOK_EVERY: Duration = Duration::from_millis(200);
+const POLL_EVERY: Duration = Duration::from_millis(200);
 /// Number of newest missions that are polled.
 const MISSIONS_MAX: u32 = 1_000;
 
@@ -48,7 +48,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     };
     let robots = choose_robots(&scenario, arguments.robots)?;
     let folder = DataFolder::new(arguments.data_dir.clone())?;
-    let tell = |text: &str| {
+    let print_step = |text: &str| {
         if !arguments.json {
             print_note(text);
         }
@@ -56,7 +56,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
 
     // Before anything starts that it must stop.
     let mut signals = ShutdownSignals::listen()?;
-    tell("starting server, database and router …");
+    print_step("starting server, database and router …");
     let mut processes = Processes::start_server(folder.path(), arguments.port, &scenario.site)?;
     let token = credentials::read_token(&processes.token_file())?;
     let client = Client::new(&processes.api_address(), Some(&token), TrustAnchor::System)?;
@@ -74,12 +74,12 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
         None => None,
         Some(Err(error)) => Some(Err(error)),
         Some(Ok((terrains, missions))) => {
-            tell(&welcome(&client, &processes, folder.path(), missions.len()));
+            print_step(&welcome(&client, &processes, folder.path(), missions.len()));
             let watch = Watch::new(&demo, &terrains, missions, &arguments);
             Some(watch.watch_until_end(&mut processes, &mut signals).await)
         }
     };
-    tell("stopping …");
+    print_step("stopping …");
     processes.stop().await;
     let Some(Ended {
         report,
@@ -103,10 +103,10 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
 
 fn choose_robots(scenario: &Scenario, count: u32) -> anyhow::Result<Vec<ScenarioRobot>> {
     let count = usize::try_from(count)?;
-    let there = scenario.robots.len();
+    let available = scenario.robots.len();
     ensure!(
-        count <= there,
-        "the scenario has {there} robots, not {count}: ask for fewer with --robots, or write \
+        count <= available,
+        "the scenario has {available} robots, not {count}: ask for fewer with --robots, or write \
          more into a scenario of your own and give it with --scenario"
     );
     Ok(scenario.robots.iter().take(count).cloned().collect())
@@ -222,7 +222,7 @@ impl Demo<'_> {
                 Instant::now() < deadline,
                 "the server is not ready after {START_WAIT_MAX:?}"
             );
-            tokio::time::sleep(LOOK_EVERY).await;
+            tokio::time::sleep(POLL_EVERY).await;
         }
         Ok(())
     }
@@ -273,7 +273,7 @@ impl Demo<'_> {
                     missing.id
                 );
             }
-            tokio::time::sleep(LOOK_EVERY).await;
+            tokio::time::sleep(POLL_EVERY).await;
         }
     }
 
@@ -372,7 +372,7 @@ impl<'demo> Watch<'demo> {
     /// Returns when all missions have ended and all measurements are uploaded, or when the time is
     /// over. Without a time limit it shows the fleet until it is cancelled.
     async fn until_done(&mut self, processes: &mut Processes) -> anyhow::Result<()> {
-        let mut ticks = tokio::time::interval(LOOK_EVERY);
+        let mut ticks = tokio::time::interval(POLL_EVERY);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut uploads_until: Option<Instant> = None;
         loop {
@@ -415,7 +415,7 @@ impl<'demo> Watch<'demo> {
             let place = live.pose.filter(|_| live.mission.is_some());
             let under = place.and_then(|pose| terrain_at(&self.shapes, pose.value.position()));
             if let Some(shape) = under {
-                *self.driven.entry(shape.terrain.id.clone()).or_default() += LOOK_EVERY;
+                *self.driven.entry(shape.terrain.id.clone()).or_default() += POLL_EVERY;
             }
         }
         self.progress.show(&robots, &self.seen);

@@ -23,7 +23,7 @@ const PORTS_TRIED: u16 = 50;
 /// Maximum time for processes to stop; afterwards they are killed.
 const STOP_WAIT_MAX: Duration = Duration::from_secs(10);
 /// Polling period of processes that are stopping.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+const POLL_EVERY: Duration = Duration::from_millis(20);
 /// Number of log lines to show when a process has ended unexpectedly.
 const LOG_LINES_SHOWN: usize = 15;
 
@@ -190,20 +190,20 @@ async fn stop_all(parts: &mut [Part]) {
     let deadline = Instant::now() + STOP_WAIT_MAX;
     for part in parts {
         while Instant::now() < deadline && matches!(part.child.try_wait(), Ok(None)) {
-            tokio::time::sleep(LOOK_EVERY).await;
+            tokio::time::sleep(POLL_EVERY).await;
         }
         _ = part.child.kill();
         _ = part.child.wait();
     }
 }
 
-/// Returns the loopback address with the first free port from `wanted` on.
-fn free_address(wanted: u16) -> anyhow::Result<SocketAddr> {
-    let last = wanted.saturating_add(PORTS_TRIED);
-    for port in wanted..=last {
+/// Returns the loopback address with the first free port from `first` on.
+fn free_address(first: u16) -> anyhow::Result<SocketAddr> {
+    let last = first.saturating_add(PORTS_TRIED);
+    for port in first..=last {
         if let Ok(listener) = TcpListener::bind((Ipv4Addr::LOCALHOST, port)) {
             return listener.local_addr().context("a bound port has an address");
         }
     }
-    bail!("no port from {wanted} to {last} is free on the loopback: choose another with --port")
+    bail!("no port from {first} to {last} is free on the loopback: choose another with --port")
 }

@@ -178,7 +178,7 @@ impl Robot {
             pose: measured.pose,
             position_std_dev_m: self.localisation.position_std_dev_m(),
             present: measured.twist,
-            wanted: self.model.twist_from_wheel_speeds(output.wheel_speeds),
+            requested: self.model.twist_from_wheel_speeds(output.wheel_speeds),
             mu_lower: None,
         };
         let reasons = Reasons {

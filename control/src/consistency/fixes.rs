@@ -171,7 +171,7 @@ pub(super) struct Fixes {
     /// Number of fixes at the expected position since the start.
     agreed: u32,
     /// Newest of the fixes that agree on another position, time of the first one, and their number.
-    elsewhere: Option<(Fix, f64, u32)>,
+    other_position: Option<(Fix, f64, u32)>,
     jump: Option<Jump>,
     back_since_s: Option<f64>,
 }
@@ -187,7 +187,7 @@ impl Default for Fixes {
             anchor: None,
             before: None,
             agreed: 0,
-            elsewhere: None,
+            other_position: None,
             jump: None,
             back_since_s: None,
         }
@@ -293,11 +293,11 @@ impl Fixes {
         }
         self.back_since_s = None;
         let (by_m, by_rad, _) = anchor.error(&fix);
-        let (since_s, count) = match self.elsewhere {
+        let (since_s, count) = match self.other_position {
             Some((last, since_s, count)) if agrees(&last) => (since_s, count + 1),
             Some(_) | None => (fix.at_s, 1),
         };
-        self.elsewhere = Some((fix, since_s, count));
+        self.other_position = Some((fix, since_s, count));
         if count >= JUMP_FIXES && self.agreed < JUMP_FIXES && self.jump.is_none() {
             // The first of all fixes was the outlier.
             self.count = 0;
@@ -319,7 +319,7 @@ impl Fixes {
 
     fn clear_jump(&mut self, fix: Fix) {
         self.anchor = Some(fix);
-        self.elsewhere = None;
+        self.other_position = None;
         self.jump = None;
         self.back_since_s = None;
     }
@@ -373,7 +373,7 @@ impl Fixes {
         }
         let (position_m, heading_rad) = self.std_devs;
         let fit = |column: usize| {
-            let (std_dev, usual) = if column < HEADING {
+            let (std_dev, slope_std_dev) = if column < HEADING {
                 (position_m, USUAL.0)
             } else {
                 (heading_rad, USUAL.1)
@@ -397,7 +397,7 @@ impl Fixes {
             let bend = Bend {
                 begin_s: -span_s,
                 std_dev,
-                usual,
+                slope_std_dev,
             };
             let (speed, std_dev) = bend.fit(points)?;
             let drift = if column < HEADING { DRIFT.0 } else { DRIFT.1 };
@@ -439,7 +439,7 @@ struct Bend {
     /// Minimum standard deviation of a point.
     std_dev: f64,
     /// Standard deviation of the slope before the bend.
-    usual: f64,
+    slope_std_dev: f64,
 }
 
 impl Bend {
@@ -458,7 +458,7 @@ impl Bend {
             }
             count += 1.0;
         }
-        normal[1][1] += (self.std_dev / self.usual).powi(2);
+        normal[1][1] += (self.std_dev / self.slope_std_dev).powi(2);
         let inverse = inverse(&normal)?;
         let solution = [0, 1, 2].map(|i| {
             let row: &[f64; 3] = &inverse[i];

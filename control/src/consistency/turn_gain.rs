@@ -1,9 +1,9 @@
 //! Gain from the turn rate by wheels to that of the body, for this robot on this ground: it depends
 //! on scrub and rolling radii.
 //!
-//! Regression of the gyro on the wheels with exponential forgetting, while nothing contradicts. It
-//! makes the wheels a sharper reference where gyro and position contradict each other. Nothing else
-//! uses it. The gain is bounded, so that no fault is learned away.
+//! The gain is the regression of the gyro on the wheels with exponential forgetting, updated while no
+//! channels contradict each other. It corrects the wheels as the reference where gyro and position
+//! contradict each other, and has no other use. It is bounded, so that it cannot absorb a fault.
 
 use super::history::{BIN_S, Means};
 

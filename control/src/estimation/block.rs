@@ -7,7 +7,7 @@ use super::types::Curvature;
 use super::window::{SampleSpan, TurnMeans, TurnWindow};
 use super::{
     BLOCK_S, RIM_SPEED_MIN_M_S, SLIP_LINEAR_FIRST_MAX, SLIP_LINEAR_MAX, SensorNoise, SensorSample,
-    THETA_FIRST, ValueWithStdDev,
+    THETA_INITIAL, ValueWithStdDev,
 };
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
@@ -114,7 +114,7 @@ impl Ends {
 pub(super) struct ThetaBound {
     /// Measured θ, if there is one.
     pub(super) theta: Option<f64>,
-    /// θ in the weights of rows: estimated, or [`THETA_FIRST`].
+    /// θ in the weights of rows: estimated, or [`THETA_INITIAL`].
     pub(super) theta_weights: f64,
     /// Upper bound of θ.
     pub(super) theta_most: f64,
@@ -126,7 +126,7 @@ impl ThetaBound {
     /// Returns the θ with which slip is computed from force: the measured one, else a small
     /// default. A vague θ may be far too large, and rows are never recomputed.
     pub(super) fn theta_of_slip(&self) -> f64 {
-        self.theta.unwrap_or(THETA_FIRST)
+        self.theta.unwrap_or(THETA_INITIAL)
     }
 }
 

@@ -171,9 +171,9 @@ impl<F: Fn(&StiffnessLoss) -> f64> CurvatureInput<'_, F> {
             let curvature = prior.mean;
             at(TyreCurve { theta, curvature })
         };
-        let (here, there) = (at_mean(theta), at_mean(THETA_STEP * theta));
-        let slope = [0, 1].map(|part| (there[part] - here[part]) / ((THETA_STEP - 1.0) * theta));
-        let alone_m_s = here[1] - slope[1] * theta;
+        let (lower, upper) = (at_mean(theta), at_mean(THETA_STEP * theta));
+        let slope = [0, 1].map(|part| (upper[part] - lower[part]) / ((THETA_STEP - 1.0) * theta));
+        let alone_m_s = lower[1] - slope[1] * theta;
         let of_theta_m_s = slope[0] * self.force_m_s;
         let found = CurvatureRegressors {
             curvature: [

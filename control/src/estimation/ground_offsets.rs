@@ -6,10 +6,10 @@ use super::offsets::OffsetKnowledge;
 use super::regression::{Normal, Solution, drivetrain_priors, inflation};
 use super::rows::{OFFSETS, ParameterMatrix, Parameters, Tangent, index};
 use super::sums::Sums;
-use super::{THETA_FIRST, THETA_RANGE, TyrePrior};
+use super::{THETA_INITIAL, THETA_RANGE, TyrePrior};
 
-/// Standard deviation of the prior of θ, with the mean [`THETA_FIRST`], when offsets are learned.
-const THETA_VAGUE: f64 = 2.0;
+/// Standard deviation of the prior of θ, with the mean [`THETA_INITIAL`], when offsets are learned.
+const THETA_PRIOR_STD_DEV: f64 = 2.0;
 
 /// Fraction of the prior information that regularises the equations when few kinds of rows exist.
 const REGULAR_SHARE: f64 = 1.0e-3;
@@ -28,7 +28,7 @@ impl OffsetKnowledge {
             return *self;
         }
         let found = solution.map_or(*tyres, |solution| solution.tyres(tyres));
-        let theta = solution.map_or(THETA_FIRST, |solution| solution.theta);
+        let theta = solution.map_or(THETA_INITIAL, |solution| solution.theta);
         let theta = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
         let channels = sums.channels();
         let tangent = Tangent::at(theta, found.at(theta));
@@ -81,12 +81,12 @@ impl OffsetKnowledge {
             .into_owned();
         let explained = with_others.dot(&others.cholesky()?.solve(&with_others));
         let theta_at = (index::THETA, index::THETA);
-        let vague = THETA_VAGUE.powi(-2);
+        let prior_information = THETA_PRIOR_STD_DEV.powi(-2);
         matrix[theta_at] = matrix[theta_at]
             .max(2.0 * normal.noise_std_dev)
             .max(explained)
-            + vague;
-        right[index::THETA] += vague * THETA_FIRST;
+            + prior_information;
+        right[index::THETA] += prior_information * THETA_INITIAL;
         marginalise(index::THETA, &mut matrix, &mut right);
         Some((
             matrix.fixed_view::<OFFSETS, OFFSETS>(1, 1).into_owned(),

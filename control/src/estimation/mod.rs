@@ -90,11 +90,11 @@ const BLOCKS_MIN: u64 = 5;
 /// Maximum plausible friction coefficient of one side; a sample with more torque is dropped.
 const MU_MAX: f64 = 10.0;
 /// θ in the weights of rows before the first estimate.
-const THETA_FIRST: f64 = 0.2;
+const THETA_INITIAL: f64 = 0.2;
 /// Range of plausible θ; an estimate outside it is not a measurement.
 const THETA_RANGE: std::ops::RangeInclusive<f64> = 5.0e-3..=10.0;
 /// Upper bound of θ before the first measurement.
-const THETA_MOST_FIRST: f64 = 2.0;
+const THETA_INITIAL_MAX: f64 = 2.0;
 /// Relative error of θ from rows on accelerations because they neglect products of θ with
 /// parameters that are still being estimated. It is common to all of a robot's segments; with
 /// torque the error of the torque constants takes its place.
@@ -187,8 +187,8 @@ impl Estimator {
             bound: ThetaBound {
                 theta: None,
                 slip_max: f64::INFINITY,
-                theta_weights: THETA_FIRST,
-                theta_most: THETA_MOST_FIRST,
+                theta_weights: THETA_INITIAL,
+                theta_most: THETA_INITIAL_MAX,
             },
             estimate: Estimate::default(),
             measured: None,
@@ -422,7 +422,7 @@ impl Estimator {
             Some(identification) => identification.identified().and_then(measurement),
             None => of_rows,
         };
-        let most = solution.map_or(THETA_MOST_FIRST, |found| {
+        let most = solution.map_or(THETA_INITIAL_MAX, |found| {
             found.theta.max(0.0) + 2.0 * found.variance.max(0.0).sqrt()
         });
         self.bound = ThetaBound {
@@ -432,14 +432,14 @@ impl Estimator {
                 .map_or(f64::INFINITY, |found| self.slip_max(&found, &sums)),
             theta_weights: solution
                 .filter(|found| found.variance > 0.0 && found.variance.sqrt() < found.theta)
-                .map_or(THETA_FIRST, |found| {
+                .map_or(THETA_INITIAL, |found| {
                     found.theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end())
                 }),
             // A measured θ may exceed the bound assumed before.
             theta_most: if of_rows.is_some() {
                 most
             } else {
-                most.min(THETA_MOST_FIRST)
+                most.min(THETA_INITIAL_MAX)
             },
         };
         self.estimate = Estimate {

@@ -6,7 +6,7 @@ use super::rows::{OFFSETS, index};
 use super::{SensorNoise, TyrePrior, ValueWithStdDev};
 
 /// Prior information on `θf` on new ground, negligible compared with any measurement.
-const RESISTANCE_VAGUE: f64 = 1.0;
+const RESISTANCE_PRIOR_INFORMATION: f64 = 1.0;
 
 /// Estimate of the shared parameters in information form: those of the indices 1 to [`OFFSETS`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,22 +26,22 @@ impl OffsetKnowledge {
         let weight = |std_dev: f64| std_dev.max(1.0e-6).powi(-2);
         let radius = weight(noise.radius_ratio);
         let mut information = SMatrix::zeros();
-        let mut put = |parameter: usize, value: f64| {
+        let mut set_diagonal = |parameter: usize, value: f64| {
             information[(parameter - 1, parameter - 1)] = value;
         };
-        put(index::RADIUS_OFFSET, 2.0 * radius);
-        put(index::RADIUS_DIFFERENCE, 0.5 * radius);
-        put(index::TRACK, weight(tyres.lateral_stiffness_std_dev));
-        put(index::GYRO_OFFSET, weight(noise.gyro_offset_rad_s));
-        put(
+        set_diagonal(index::RADIUS_OFFSET, 2.0 * radius);
+        set_diagonal(index::RADIUS_DIFFERENCE, 0.5 * radius);
+        set_diagonal(index::TRACK, weight(tyres.lateral_stiffness_std_dev));
+        set_diagonal(index::GYRO_OFFSET, weight(noise.gyro_offset_rad_s));
+        set_diagonal(
             index::LONGITUDINAL_OFFSET,
             weight(noise.accelerometer_offset_m_s2),
         );
-        put(
+        set_diagonal(
             index::LONGITUDINAL_SCALE,
             weight(noise.accelerometer_scale_ratio),
         );
-        put(index::RESISTANCE, RESISTANCE_VAGUE);
+        set_diagonal(index::RESISTANCE, RESISTANCE_PRIOR_INFORMATION);
         Self {
             information,
             weighted: SVector::zeros(),
@@ -61,7 +61,7 @@ impl OffsetKnowledge {
             known.information[(place, other)] = 0.0;
             known.information[(other, place)] = 0.0;
         }
-        known.information[(place, place)] = RESISTANCE_VAGUE;
+        known.information[(place, place)] = RESISTANCE_PRIOR_INFORMATION;
         known.weighted[place] = 0.0;
         known.knows_resistance = false;
         known

@@ -35,7 +35,7 @@ pub struct FenceInput {
     /// Measured twist, body frame.
     pub present: Twist,
     /// Commanded twist before the limit, body frame.
-    pub wanted: Twist,
+    pub requested: Twist,
     /// Lower bound of the ground's friction coefficient; None, or a value not above zero, acts as
     /// [`MU_UNKNOWN`].
     pub mu_lower: Option<f64>,
@@ -159,7 +159,7 @@ impl Fence {
 
     /// Returns whether a motion of a robot outside increases the clearance of its centre, which is
     /// `clearance_m`, or leaves the disc in place.
-    fn leads_back(&self, pose: Pose, twist: Twist, clearance_m: f64) -> bool {
+    fn returns_inside(&self, pose: Pose, twist: Twist, clearance_m: f64) -> bool {
         if twist.linear_m_s.abs() < 1.0e-6 {
             // Turning on the spot leaves the disc where it is.
             return true;
@@ -174,7 +174,7 @@ impl Fence {
     }
 
     /// Computes the clearance, and the speed limit from the free distance along both the present
-    /// and the wanted arc. A robot outside is limited to [`RETURN_MAX_M_S`] where its motion
+    /// and the requested arc. A robot outside is limited to [`RETURN_MAX_M_S`] where its motion
     /// increases the clearance, else to 0. Input that is not finite gives a limit of 0; an empty
     /// fence gives none.
     pub fn limit_speed(&self, input: &FenceInput, model: &RobotModel) -> FenceLimit {
@@ -188,7 +188,7 @@ impl Fence {
             clearance_m: f64::NEG_INFINITY,
             speed_max_m_s: Some(0.0),
         };
-        if !(input.pose.is_finite() && input.present.is_finite() && input.wanted.is_finite()) {
+        if !(input.pose.is_finite() && input.present.is_finite() && input.requested.is_finite()) {
             return stop;
         }
         if !input.position_std_dev_m.is_finite() {
@@ -204,7 +204,7 @@ impl Fence {
         };
         if clearance_m < STEP_MIN_M {
             return cap(
-                if self.leads_back(input.pose, input.wanted, centre_clearance_m) {
+                if self.returns_inside(input.pose, input.requested, centre_clearance_m) {
                     RETURN_MAX_M_S
                 } else {
                     0.0
@@ -216,7 +216,7 @@ impl Fence {
             .present
             .linear_m_s
             .abs()
-            .max(input.wanted.linear_m_s.abs());
+            .max(input.requested.linear_m_s.abs());
         // Farther than the stopping distance, so that the limit does not switch on and off at its
         // edge.
         let lookahead_m = 1.2 * braking.stopping_distance_m(fastest_m_s);
@@ -230,7 +230,7 @@ impl Fence {
             pose: input.pose,
             radius_m,
         };
-        let free_m = [input.present, input.wanted]
+        let free_m = [input.present, input.requested]
             .into_iter()
             .map(|twist| self.free_distance_m(disc, twist, lookahead_m))
             .fold(lookahead_m, f64::min);

@@ -62,9 +62,9 @@ proptest! {
         let mut delayed = [Twist::default(); 5];
         for (linear_m_s, angular_rad_s) in twists {
             for _ in 0..100 {
-                let wanted = Twist { linear_m_s, angular_rad_s };
+                let requested = Twist { linear_m_s, angular_rad_s };
                 let input = FenceInput {
-                    pose, position_std_dev_m: 0.0, present, wanted, mu_lower: mu,
+                    pose, position_std_dev_m: 0.0, present, requested, mu_lower: mu,
                 };
                 let most_m_s = fence.limit_speed(&input, &model).speed_max_m_s;
                 let share = most_m_s.map_or(1.0, |most_m_s| {
@@ -151,7 +151,7 @@ fn along_a_fence_is_free_and_towards_it_is_slow() {
         },
         position_std_dev_m: 0.0,
         present: Twist::default(),
-        wanted: Twist {
+        requested: Twist {
             linear_m_s: 0.8,
             angular_rad_s: 0.0,
         },
@@ -175,7 +175,7 @@ fn from_outside_only_the_way_back_is_open() {
             },
             position_std_dev_m: 0.0,
             present: Twist::default(),
-            wanted: Twist {
+            requested: Twist {
                 linear_m_s,
                 angular_rad_s: 0.1,
             },
@@ -224,7 +224,7 @@ fn a_pose_that_is_no_number_stops() {
         },
         position_std_dev_m: 0.0,
         present: Twist::default(),
-        wanted: Twist::default(),
+        requested: Twist::default(),
         mu_lower: None,
     };
     let verdict = yard().limit_speed(&input, &RobotModel::yi2007());
@@ -257,7 +257,7 @@ fn a_fence_without_room_stops_every_way_of_driving() {
             pose: Pose::default(),
             position_std_dev_m: 0.0,
             present: Twist::default(),
-            wanted: Twist {
+            requested: Twist {
                 linear_m_s,
                 angular_rad_s: 0.3,
             },

@@ -324,7 +324,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
         to: target,
     };
     let wheel_speeds = ramped(change, step, limits);
-    let is_short = |got: f64, wanted: f64| (got - wanted).abs() > 1.0e-9;
+    let is_short = |limited: f64, requested: f64| (limited - requested).abs() > 1.0e-9;
     if is_short(wheel_speeds.left_rad_s, target.left_rad_s)
         || is_short(wheel_speeds.right_rad_s, target.right_rad_s)
     {

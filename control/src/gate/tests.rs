@@ -57,14 +57,14 @@ fn caps_of(reasons: &Reasons) -> impl Iterator<Item = (f64, GateCause)> + use<> 
     })
 }
 
-/// Whether neither forward speed nor turn rate exceeds both the wanted and the previous command.
-fn is_within(got: WheelSpeeds, before: WheelSpeeds, wanted: WheelSpeeds) -> bool {
+/// Whether neither forward speed nor turn rate exceeds both the requested and the previous command.
+fn is_within(limited: WheelSpeeds, before: WheelSpeeds, requested: WheelSpeeds) -> bool {
     let model = RobotModel::yi2007();
-    let [got, before, wanted] =
-        [got, before, wanted].map(|wheels| model.twist_from_wheel_speeds(wheels));
-    let most = |before: f64, wanted: f64| before.abs().max(wanted.abs()) + 1.0e-9;
-    got.linear_m_s.abs() <= most(before.linear_m_s, wanted.linear_m_s)
-        && got.angular_rad_s.abs() <= most(before.angular_rad_s, wanted.angular_rad_s)
+    let [limited, before, requested] =
+        [limited, before, requested].map(|wheels| model.twist_from_wheel_speeds(wheels));
+    let most = |before: f64, requested: f64| before.abs().max(requested.abs()) + 1.0e-9;
+    limited.linear_m_s.abs() <= most(before.linear_m_s, requested.linear_m_s)
+        && limited.angular_rad_s.abs() <= most(before.angular_rad_s, requested.angular_rad_s)
 }
 
 /// One tick of a gate with random input.
@@ -123,8 +123,8 @@ proptest! {
         let previous = WheelSpeeds { left_rad_s: before_left, right_rad_s: before_right };
         let input = GateInput { command, previous, stop, feedback_age_s: age_s, dt_s };
         let output = gate(&input, &limits);
-        let wanted = command.filter(|wanted| wanted.is_finite()).unwrap_or_default();
-        prop_assert!(is_within(output.wheel_speeds, previous, wanted));
+        let requested = command.filter(|requested| requested.is_finite()).unwrap_or_default();
+        prop_assert!(is_within(output.wheel_speeds, previous, requested));
         for (got, before) in [
             (output.wheel_speeds.left_rad_s, before_left),
             (output.wheel_speeds.right_rad_s, before_right),
@@ -156,8 +156,8 @@ proptest! {
         let output = gate_with(&input, &reasons, &limits);
         let got = output.wheel_speeds;
         prop_assert!(got.is_finite());
-        let wanted = if command.is_finite() { command } else { WheelSpeeds::default() };
-        prop_assert!(is_within(got, previous, wanted));
+        let requested = if command.is_finite() { command } else { WheelSpeeds::default() };
+        prop_assert!(is_within(got, previous, requested));
         for (got, before) in [(got.left_rad_s, before_left), (got.right_rad_s, before_right)] {
             prop_assert!((got - before).abs() <= limits.wheel_acceleration_max_rad_s2 * dt_s + 1.0e-9);
         }

@@ -15,7 +15,7 @@ pub struct CrossGains {
     /// Integral gain `k_I` on the cross-track error over the distance driven, per metre cubed, 0 to
     /// below `k_θ k_y`: that of the integral and of the adaptation together.
     pub integral_1_m3: f64,
-    /// Inner-loop gain `k_r` from turn rate error (wanted minus measured) to the turn rate command,
+    /// Inner-loop gain `k_r` from turn rate error (requested minus measured) to the turn rate command,
     /// 0 to below 1, so that no lag or delay of the base can make the loop unstable.
     pub yaw_rate: f64,
 }

@@ -50,14 +50,19 @@ impl ThetaKnowledge {
                 0.0
             }
         };
-        let (mine, its) = (weight(&self), weight(&other));
-        if mine <= 0.0 {
+        let (own_weight, other_weight) = (weight(&self), weight(&other));
+        if own_weight <= 0.0 {
             return other;
         }
         Self {
-            theta: (mine * self.theta + if its > 0.0 { its * other.theta } else { 0.0 })
-                / (mine + its),
-            std_dev: (mine + its).sqrt().recip(),
+            theta: (own_weight * self.theta
+                + if other_weight > 0.0 {
+                    other_weight * other.theta
+                } else {
+                    0.0
+                })
+                / (own_weight + other_weight),
+            std_dev: (own_weight + other_weight).sqrt().recip(),
         }
     }
 }

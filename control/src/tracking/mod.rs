@@ -89,7 +89,7 @@ const KNOWN_FROM_START_M: f64 = 1.0;
 /// Maximum magnitude of χ̂'s rate of change, per second.
 const BEYOND_RATE_MAX_1_S: f64 = 1.0;
 
-/// Speed limits that a wanted command exceeds.
+/// Speed limits that a requested command exceeds.
 #[derive(Debug, Clone, Copy)]
 struct Saturation {
     /// A wheel speed limit.
@@ -406,20 +406,20 @@ impl Tracker {
         }
     }
 
-    /// Returns the wheel speeds nearest to the wanted twist within every limit, and which speed
+    /// Returns the wheel speeds nearest to the requested twist within every limit, and which speed
     /// limit cut it.
     fn within_limits(&mut self, change: Change<Twist>, dt_s: f64) -> (WheelSpeeds, Saturation) {
-        let Change { from, to: wanted } = change;
+        let Change { from, to: target } = change;
         let limits = self.model.limits();
         let reverse_max_m_s = REVERSE_MAX_M_S.min(limits.linear_max_m_s);
         let angular_max_rad_s = limits.angular_max_rad_s;
         let bounded = Twist {
-            linear_m_s: (wanted.linear_m_s + self.remainder.linear_m_s)
+            linear_m_s: (target.linear_m_s + self.remainder.linear_m_s)
                 .clamp(-reverse_max_m_s, limits.linear_max_m_s),
-            angular_rad_s: (wanted.angular_rad_s + self.remainder.angular_rad_s)
+            angular_rad_s: (target.angular_rad_s + self.remainder.angular_rad_s)
                 .clamp(-angular_max_rad_s, angular_max_rad_s),
         };
-        let turns_too_fast = wanted.angular_rad_s.abs() > angular_max_rad_s;
+        let turns_too_fast = target.angular_rad_s.abs() > angular_max_rad_s;
         let (wheels, saturated) = desaturated(&self.model, bounded);
         let to = self.model.twist_from_wheel_speeds(wheels);
         let twist_limits = TwistLimits::of(&self.model);

@@ -1,9 +1,9 @@
 //! How steady the sideslip of the path is.
 //!
-//! The law rejects what its model of the sideslip does not explain. That is a share of the
-//! sideslip, so it changes where the sideslip changes: where a path bends, and across a slope. On a
-//! path of constant sideslip the adapted values and the integral have it after a few metres; what
-//! is left there is the noise of the pose, which soft gains follow least.
+//! The law rejects the part of the sideslip that its model does not explain. This disturbance is a
+//! fraction of the sideslip, so it changes with the sideslip: where the curvature of the path changes,
+//! and across a slope. Where the sideslip is constant, adaptation and integral compensate it
+//! after a few metres. The remaining error is noise of the pose, which small gains amplify least.
 
 use crate::reference::ReferenceSample;
 use crate::robot::GRAVITY_M_S2;

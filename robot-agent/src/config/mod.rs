@@ -299,7 +299,7 @@ pub struct AgentConfig {
     pub outbox: outbox::Limits,
     /// Destination of records of the loop; `None` for no records.
     pub recording: Option<RecordingConfig>,
-    /// What is asked of the operating system's scheduler.
+    /// Real-time priority of the loop's thread, and whether the memory is locked.
     pub realtime: RealtimeConfig,
     /// Estimator's prior of the robot's and the tyres' parameters.
     pub prior: EstimatorPrior,

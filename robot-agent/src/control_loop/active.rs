@@ -27,13 +27,13 @@ use super::prior::Prior;
 use super::surface::Comparison;
 
 /// Speed below which a held robot counts as stopped, m/s; twice the value for the yaw rate, rad/s.
-const HELD_STANDING: f64 = 0.04;
+const STANDSTILL_SPEED_MAX: f64 = 0.04;
 
 /// Result of one tick of the mission.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Step {
     /// Wheel speeds of the tracking law; zero while the robot is stopped on hold.
-    pub(super) wanted: WheelSpeeds,
+    pub(super) wheel_speeds: WheelSpeeds,
     /// Reason of the mission's end, if it ended in this tick.
     pub(super) end: Option<EndReason>,
     /// Begin or end of a pause in this tick.
@@ -292,7 +292,7 @@ impl Active {
         if self.is_standing_on_hold() && is_on_the_way {
             self.tracked = None;
             return Step {
-                wanted: WheelSpeeds::default(),
+                wheel_speeds: WheelSpeeds::default(),
                 end: None,
                 pause_change,
                 theta_loop: None,
@@ -315,7 +315,7 @@ impl Active {
             | FollowerStatus::Stopping => None,
         };
         Step {
-            wanted: output.wheel_speeds,
+            wheel_speeds: output.wheel_speeds,
             end,
             pause_change,
             theta_loop: Some(output.theta_loop),
@@ -325,9 +325,9 @@ impl Active {
     fn record_standstill(&mut self, measured: &Measured, model: &RobotModel, command: WheelSpeeds) {
         let command_m_s = command.magnitude_max_rad_s() * model.wheel_radius_m();
         let stands = self.is_on_hold()
-            && command_m_s < HELD_STANDING
-            && measured.twist.linear_m_s.abs() < HELD_STANDING
-            && measured.twist.angular_rad_s.abs() < 2.0 * HELD_STANDING;
+            && command_m_s < STANDSTILL_SPEED_MAX
+            && measured.twist.linear_m_s.abs() < STANDSTILL_SPEED_MAX
+            && measured.twist.angular_rad_s.abs() < 2.0 * STANDSTILL_SPEED_MAX;
         self.standing_ticks = if stands || self.is_standing_on_hold() {
             self.standing_ticks.saturating_add(1)
         } else {

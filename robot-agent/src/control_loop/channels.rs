@@ -47,7 +47,8 @@ pub(crate) enum Hold {
     Replacement,
     /// An external limit holds the robot; the mission goes on when the limit ends.
     Outside,
-    /// The base is silent, or was heard again too recently; the mission goes on by itself.
+    /// The base is silent, or sends again for too short a time; the mission goes on when it has sent for
+    /// long enough.
     Base,
     /// The control loop does not keep its rate; the mission goes on when it does.
     Overrun,
@@ -338,7 +339,7 @@ pub(crate) struct Shared {
     /// Plan that was given to the loop last, for display; the loop does not read it.
     plan: Mutex<Option<GivenPlan>>,
     /// Time of the last message from the server, microseconds of the agent's monotonic clock.
-    server_heard_us: AtomicU64,
+    server_message_us: AtomicU64,
 }
 
 impl Shared {
@@ -372,22 +373,22 @@ impl Shared {
     /// Records a message from the server at `now`.
     pub(crate) fn record_server_message(&self, now: Duration) {
         let now_us = u64::try_from(now.as_micros()).unwrap_or(u64::MAX);
-        self.server_heard_us.fetch_max(now_us, Ordering::Relaxed);
+        self.server_message_us.fetch_max(now_us, Ordering::Relaxed);
     }
 
     /// Sets the time of the server's last message to the one in a record.
-    pub(crate) fn replay_server_heard(&self, heard: Duration) {
+    pub(crate) fn replay_server_message(&self, received_at: Duration) {
         // Rounded up, so that a silence in whole microseconds is reproduced exactly and a message
         // after the begin of the tick gives a silence of zero.
-        let heard_us = heard.as_nanos().div_ceil(1_000);
-        let heard_us = u64::try_from(heard_us).unwrap_or(u64::MAX);
-        self.server_heard_us.store(heard_us, Ordering::Relaxed);
+        let received_us = received_at.as_nanos().div_ceil(1_000);
+        let received_us = u64::try_from(received_us).unwrap_or(u64::MAX);
+        self.server_message_us.store(received_us, Ordering::Relaxed);
     }
 
     /// Returns the time since the last message from the server.
     pub(crate) fn server_silence(&self, now: Duration) -> Duration {
-        let heard = Duration::from_micros(self.server_heard_us.load(Ordering::Relaxed));
-        now.saturating_sub(heard)
+        let received_at = Duration::from_micros(self.server_message_us.load(Ordering::Relaxed));
+        now.saturating_sub(received_at)
     }
 }
 

@@ -44,7 +44,7 @@ pub(crate) struct TickInputs {
 /// Outputs of a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TickOutputs {
-    pub(crate) wanted: WheelSpeeds,
+    pub(crate) requested: WheelSpeeds,
     pub(crate) command: WheelSpeeds,
     pub(crate) pose: Option<Pose>,
     pub(crate) twist: Twist,
@@ -154,13 +154,13 @@ pub(crate) struct Notes {
 pub(crate) fn notes() -> (RecordSender, Notes) {
     let (sender, receiver) = sync_channel(NOTES_MAX);
     let lost = Arc::new(AtomicU64::new(0));
-    let taker = RecordSender {
+    let record_sender = RecordSender {
         notes: sender,
         lost: Arc::clone(&lost),
         commands: 0,
     };
     (
-        taker,
+        record_sender,
         Notes {
             notes: receiver,
             lost,

@@ -32,13 +32,13 @@ impl SlipMeter {
     /// is silent.
     pub(crate) fn step(
         &mut self,
-        heard: Option<(BodyVelocity, WheelSpeeds)>,
+        measured: Option<(BodyVelocity, WheelSpeeds)>,
         model: &RobotModel,
         dt_s: f64,
     ) {
         let share = (dt_s / MEMORY_S).clamp(0.0, 1.0);
         let toward = |before: f64, now: f64| before + share * (now - before);
-        let now = heard.and_then(|(velocity, wheels)| {
+        let now = measured.and_then(|(velocity, wheels)| {
             let mean = &mut self.wheels;
             mean.left_rad_s = toward(mean.left_rad_s, wheels.left_rad_s);
             mean.right_rad_s = toward(mean.right_rad_s, wheels.right_rad_s);

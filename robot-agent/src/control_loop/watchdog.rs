@@ -1,4 +1,4 @@
-//! Watchdog of the loop: logs when no tick has run for [`SAY_AFTER`], and ends the agent after
+//! Watchdog of the loop: logs when no tick has run for [`LOG_AFTER`], and ends the agent after
 //! [`END_AFTER`].
 //!
 //! The base has a watchdog of its own and stops the wheels without commands; ending the process
@@ -17,7 +17,7 @@ use crate::control_loop::channels::Shared;
 /// Interval of the checks.
 pub(crate) const CHECK_EVERY: Duration = Duration::from_millis(100);
 /// Time without a tick after which it is logged.
-pub(crate) const SAY_AFTER: Duration = Duration::from_millis(500);
+pub(crate) const LOG_AFTER: Duration = Duration::from_millis(500);
 /// Time without a tick after which the agent ends.
 pub(crate) const END_AFTER: Duration = Duration::from_secs(2);
 
@@ -29,7 +29,7 @@ pub(crate) const OWN_GAP_MAX: Duration = Duration::from_millis(300);
 pub(crate) enum Finding {
     /// The loop ticks, or its silence is too short or logged already.
     Fine,
-    /// No tick for [`SAY_AFTER`], found for the first time.
+    /// No tick for [`LOG_AFTER`], found for the first time.
     StandsStill,
     /// The loop ticks again after it was reported.
     TicksAgain,
@@ -80,7 +80,7 @@ impl TickWatch {
         let stood = now.saturating_sub(self.since);
         if stood >= END_AFTER {
             Finding::GiveUp
-        } else if stood >= SAY_AFTER && !self.is_said {
+        } else if stood >= LOG_AFTER && !self.is_said {
             self.is_said = true;
             Finding::StandsStill
         } else {

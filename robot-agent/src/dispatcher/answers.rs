@@ -15,7 +15,7 @@ use crate::safety::stop::ClearRefusal;
 use crate::safety::{NotCleared, Safety};
 
 /// Largest age of the loop's snapshot by which the robot may count as stopped.
-const STANDS_AGE_MAX: Duration = Duration::from_millis(500);
+const SNAPSHOT_AGE_MAX: Duration = Duration::from_millis(500);
 
 /// Puts a stop in force; returns once the loop's target is zero and the latch is on disk.
 pub(crate) async fn stop(safety: &Arc<Safety>, stop: &Stop) -> Result<(), CommandRefusal> {
@@ -39,7 +39,7 @@ pub(crate) async fn clear(
 ) -> Result<(), CommandRefusal> {
     if safety.latch().is_some_and(|latch| latch.id == clear.stop) {
         let snapshot = shared.snapshot();
-        if clock.monotonic().saturating_sub(snapshot.at) > STANDS_AGE_MAX {
+        if clock.monotonic().saturating_sub(snapshot.at) > SNAPSHOT_AGE_MAX {
             return Err(not_ready("the control loop stands still"));
         }
         if !snapshot.stands {

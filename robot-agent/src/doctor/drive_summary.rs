@@ -391,7 +391,7 @@ pub(super) fn newest_heading_rad(settings: &Ros2Settings, messages: &[Message]) 
 /// Returns the torque during the acceleration.
 fn acceleration(settings: &Ros2Settings, messages: &[Message]) -> Option<AccelerationPhase> {
     let mut torque = Mean::default();
-    let mut said = Vec::with_capacity(messages.len());
+    let mut speeds_over_time = Vec::with_capacity(messages.len());
     for message in messages {
         let Ok(Some((stamp, content))) = decoded(settings, message.source, &message.payload) else {
             continue;
@@ -403,13 +403,13 @@ fn acceleration(settings: &Ros2Settings, messages: &[Message]) -> Option<Acceler
         {
             torque.add(torques.left_n_m + torques.right_n_m);
             let speed_rad_s = 0.5 * (speeds.left_rad_s + speeds.right_rad_s);
-            said.push((seconds(stamp), speed_rad_s));
+            speeds_over_time.push((seconds(stamp), speed_rad_s));
         }
     }
-    let ((first_s, _), (last_s, _)) = (said.first()?, said.last()?);
+    let ((first_s, _), (last_s, _)) = (speeds_over_time.first()?, speeds_over_time.last()?);
     let intervals = torque.count - 1.0;
     let mut gained = Mean::default();
-    for (_, speed_rad_s) in said.iter().rev().take(LAST_SPEEDS) {
+    for (_, speed_rad_s) in speeds_over_time.iter().rev().take(LAST_SPEEDS) {
         gained.add(*speed_rad_s);
     }
     let gained_rad_s = gained.value()?;
@@ -429,7 +429,7 @@ fn seconds(stamp: Time) -> f64 {
 fn speed_of(places: &[(f64, Position)]) -> Option<f64> {
     let (first_s, first) = places.first()?;
     let (sin, cos) = first.pose.heading_rad.sin_cos();
-    let (mut span, mut way) = (Mean::default(), Mean::default());
+    let (mut span, mut distance) = (Mean::default(), Mean::default());
     let points: Vec<(f64, f64)> = places
         .iter()
         .map(|(at_s, place)| {
@@ -438,10 +438,10 @@ fn speed_of(places: &[(f64, Position)]) -> Option<f64> {
         })
         .inspect(|(at_s, forward_m)| {
             span.add(*at_s);
-            way.add(*forward_m);
+            distance.add(*forward_m);
         })
         .collect();
-    let (middle_s, middle_m) = (span.value()?, way.value()?);
+    let (middle_s, middle_m) = (span.value()?, distance.value()?);
     let (mut squares, mut products) = (0.0, 0.0);
     for (at_s, forward_m) in points {
         squares += (at_s - middle_s).powi(2);

@@ -47,7 +47,7 @@ use crate::geometry::control_model;
 /// Time for which the doctor listens to the stopped robot.
 const LISTEN_FOR: Duration = Duration::from_secs(3);
 /// Maximum wait for the first message.
-const FIRST_WORD_MAX: Duration = Duration::from_secs(5);
+const FIRST_MESSAGE_WAIT_MAX: Duration = Duration::from_secs(5);
 /// Time between two commands.
 const PERIOD: Duration = Duration::from_millis(10);
 /// Duration of the ramp from zero to full speed, and back.
@@ -145,7 +145,7 @@ fn examine_base(
     let buffer = Arc::new(MessageBuffer::default());
     let observer: Arc<dyn MessageObserver> = Arc::<MessageBuffer>::clone(&buffer);
     let (drive, bus) = Ros2Drive::examined(settings.clone(), &clock, &observer)?;
-    let speaking = std::thread::Builder::new()
+    let bus_thread = std::thread::Builder::new()
         .name("robot's bus".to_owned())
         .spawn(move || bus.run())
         .context("no thread")?;
@@ -153,10 +153,10 @@ fn examine_base(
         drive,
         clock,
         limits: GateLimits::of(&model),
-        said: WheelSpeeds::default(),
+        command: WheelSpeeds::default(),
         parameters: Parameters::new(model, config.prior),
     };
-    let until = examined.clock.monotonic() + FIRST_WORD_MAX;
+    let until = examined.clock.monotonic() + FIRST_MESSAGE_WAIT_MAX;
     while buffer.is_empty() && examined.clock.monotonic() < until {
         examined.hold(WheelSpeeds::default(), PERIOD);
     }
@@ -173,7 +173,7 @@ fn examine_base(
     let clock = Arc::clone(&examined.clock);
     drop(examined);
     // A session that does not close is left to the end of the process.
-    while !speaking.is_finished() && clock.monotonic() < until {
+    while !bus_thread.is_finished() && clock.monotonic() < until {
         std::thread::sleep(PERIOD);
     }
     Ok(findings)
@@ -184,7 +184,7 @@ struct ExaminedDrive {
     drive: Ros2Drive,
     clock: SharedClock,
     limits: GateLimits,
-    said: WheelSpeeds,
+    command: WheelSpeeds,
     parameters: Parameters,
 }
 
@@ -220,15 +220,15 @@ impl ExaminedDrive {
         }
         let rim_rad_s = RIM_M_S / model.wheel_radius_m();
         let speeds = |left: f64, right: f64| {
-            let asked = WheelSpeeds {
+            let requested = WheelSpeeds {
                 left_rad_s: left * rim_rad_s,
                 right_rad_s: right * rim_rad_s,
             };
-            let twist = model.twist_from_wheel_speeds(asked);
+            let twist = model.twist_from_wheel_speeds(requested);
             let share = TwistLimits::of(model).share_within(twist);
             WheelSpeeds {
-                left_rad_s: share * asked.left_rad_s,
-                right_rad_s: share * asked.right_rad_s,
+                left_rad_s: share * requested.left_rad_s,
+                right_rad_s: share * requested.right_rad_s,
             }
         };
         buffer.clear();
@@ -276,14 +276,14 @@ impl ExaminedDrive {
             self.parameters.take(&feedback);
             let input = GateInput {
                 command: Some(command),
-                previous: self.said,
+                previous: self.command,
                 stop: false,
                 // The drive itself commands zero to a silent base.
                 feedback_age_s: 0.0,
                 dt_s: PERIOD.as_secs_f64(),
             };
-            self.said = gate(&input, &self.limits).wheel_speeds;
-            self.drive.write(self.said);
+            self.command = gate(&input, &self.limits).wheel_speeds;
+            self.drive.write(self.command);
             if !may(&self.drive) {
                 return false;
             }
@@ -294,7 +294,7 @@ impl ExaminedDrive {
 
     /// Changes the command linearly to `to`; returns false at once if the base falls silent.
     fn ramp(&mut self, to: WheelSpeeds) -> bool {
-        let from = self.said;
+        let from = self.command;
         let steps = u32::try_from(RAMP.as_millis() / PERIOD.as_millis()).unwrap_or(1);
         (1..=steps).all(|step| {
             let share = f64::from(step) / f64::from(steps);

@@ -19,7 +19,7 @@ const STANDING_SHARE: f64 = 0.2;
 /// Smallest yaw rate of a robot that turns, rad/s.
 const TURNING_RAD_S: f64 = 0.05;
 /// Ratio to the wheels' speed below which a robot counts as not moving over ground.
-const GOING_SHARE: f64 = 0.3;
+const DRIVING_RATIO_MIN: f64 = 0.3;
 /// Largest accepted relative error of the wheel radius.
 const RADIUS_SHARE: f64 = 0.06;
 
@@ -29,10 +29,10 @@ fn sign(value: f64) -> i8 {
 }
 
 /// Returns the signs of the wheels' speeds, `[left, right]`, 0 for those that stand still.
-fn directions(said: WheelSpeeds, drove: &DriveSummary) -> [i8; 2] {
+fn directions(reported: WheelSpeeds, summary: &DriveSummary) -> [i8; 2] {
     let direction = |of_side: fn(WheelSpeeds) -> f64| {
-        let speed_rad_s = of_side(said);
-        let stands = speed_rad_s.abs() < STANDING_SHARE * of_side(drove.commanded).abs();
+        let speed_rad_s = of_side(reported);
+        let stands = speed_rad_s.abs() < STANDING_SHARE * of_side(summary.commanded).abs();
         if stands { 0 } else { sign(speed_rad_s) }
     };
     [
@@ -55,7 +55,7 @@ pub(super) fn findings(
              is overloaded",
         )];
     }
-    let (Some(turning), Some(going)) = (turned.wheels, forward.wheels) else {
+    let (Some(turning), Some(driving)) = (turned.wheels, forward.wheels) else {
         return vec![Finding::on("wheels").wrong(
             Key("drive.ros2.joints.topic"),
             "the wheels said nothing while they were commanded to move",
@@ -68,7 +68,7 @@ pub(super) fn findings(
         findings.push(Finding::on("sides").skipped(text));
         return findings;
     }
-    let of_forward = directions(going, forward);
+    let of_forward = directions(driving, forward);
     // By the command, since joints that disagree have no meaningful mean.
     let commanded_rad_s = 0.5 * (forward.commanded.left_rad_s + forward.commanded.right_rad_s);
     let rim_m_s = model.wheel_radius_m() * commanded_rad_s;
@@ -81,13 +81,13 @@ pub(super) fn findings(
         .filter(|_| !frozen.odometry && is_twist_well));
     let turn_rad_s = turned.turn_rad_s.filter(|_| !frozen.gyro);
     let turn_rad_s = turn_rad_s.map(|rate| rate - gyro_bias_rad_s);
-    let goes = |ground_m_s: &f64| ground_m_s.abs() > GOING_SHARE * rim_m_s.abs();
-    let turns = |rate: &f64| rate.abs() > TURNING_RAD_S;
+    let is_driving = |ground_m_s: &f64| ground_m_s.abs() > DRIVING_RATIO_MIN * rim_m_s.abs();
+    let is_turning = |rate: &f64| rate.abs() > TURNING_RAD_S;
     let answers = Answers {
         turn: directions(turning, turned),
         forward: of_forward,
-        turned: turn_rad_s.filter(turns).map_or(0, sign),
-        went: ground_m_s.filter(goes).map_or(0, sign),
+        turned: turn_rad_s.filter(is_turning).map_or(0, sign),
+        drove: ground_m_s.filter(is_driving).map_or(0, sign),
     };
     if let Some(standing) = of_standing(answers) {
         findings.push(standing);
@@ -101,11 +101,11 @@ pub(super) fn findings(
         findings.push(Finding::on("track").skipped(text));
         return findings;
     }
-    let stays = ground_m_s.is_some() && answers.went == 0;
+    let stays = ground_m_s.is_some() && answers.drove == 0;
     findings.extend(of_still_body(turn_rad_s, stays, settings));
     let radius_m = ground_m_s
-        .filter(|_| answers.went != 0)
-        .map(|ground_m_s| 2.0 * ground_m_s / (going.left_rad_s + going.right_rad_s));
+        .filter(|_| answers.drove != 0)
+        .map(|ground_m_s| 2.0 * ground_m_s / (driving.left_rad_s + driving.right_rad_s));
     findings.extend(radius_m.map(|radius_m| of_radius(model, radius_m)));
     let radius_m = radius_m.unwrap_or(model.wheel_radius_m());
     let mut of_track = drives.clone();

@@ -18,7 +18,7 @@ pub(super) struct Answers {
     /// Direction of the turn by the gyro, 1 to the left; 0 if unknown.
     pub(super) turned: i8,
     /// Direction of the drive by position or speed over ground, 1 forward; 0 if unknown.
-    pub(super) went: i8,
+    pub(super) drove: i8,
 }
 
 /// A sign or side that is inverted or swapped.
@@ -113,8 +113,8 @@ impl Flip {
 /// Returns the responses of a robot with these flips.
 fn predicted(flips: &[Flip]) -> Answers {
     let sign = |flip: Flip| if flips.contains(&flip) { -1 } else { 1 };
-    let (turned, went) = (sign(Flip::TurnCommand), sign(Flip::ForwardCommand));
-    let said = |left: i8, right: i8| {
+    let (turned, drove) = (sign(Flip::TurnCommand), sign(Flip::ForwardCommand));
+    let joints = |left: i8, right: i8| {
         let [left, right] = if flips.contains(&Flip::Sides) {
             [right, left]
         } else {
@@ -126,10 +126,10 @@ fn predicted(flips: &[Flip]) -> Answers {
         ]
     };
     Answers {
-        turn: said(-turned, turned),
-        forward: said(went, went),
+        turn: joints(-turned, turned),
+        forward: joints(drove, drove),
         turned: turned * sign(Flip::Gyro),
-        went: went * sign(Flip::Ground),
+        drove: drove * sign(Flip::Ground),
     }
 }
 
@@ -150,7 +150,7 @@ pub(super) fn explanations(answers: Answers) -> Vec<Vec<Flip>> {
             answers.turn == predicted.turn
                 && answers.forward == predicted.forward
                 && agrees(answers.turned, predicted.turned)
-                && agrees(answers.went, predicted.went)
+                && agrees(answers.drove, predicted.drove)
         })
         .collect();
     let least = found.iter().map(Vec::len).min().unwrap_or(0);
@@ -231,7 +231,7 @@ mod tests {
             turn: [sign(turn.0), sign(turn.1)],
             forward: [sign(forward.0), sign(forward.1)],
             turned: sign(turn.2),
-            went: if sees_ground { sign(forward.3) } else { 0 },
+            drove: if sees_ground { sign(forward.3) } else { 0 },
         }
     }
 

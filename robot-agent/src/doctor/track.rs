@@ -148,13 +148,13 @@ pub(super) fn findings(
     Drives { turned, forward }: &Drives,
     calibration: Calibration,
 ) -> Vec<Finding> {
-    let (Some(turning), Some(going)) = (turned.wheels, forward.wheels) else {
+    let (Some(turning), Some(driving)) = (turned.wheels, forward.wheels) else {
         return Vec::new();
     };
     let obeyed = CommandRatios {
         turn: (turning.right_rad_s - turning.left_rad_s)
             / (turned.commanded.right_rad_s - turned.commanded.left_rad_s),
-        forward: (going.left_rad_s + going.right_rad_s)
+        forward: (driving.left_rad_s + driving.right_rad_s)
             / (forward.commanded.left_rad_s + forward.commanded.right_rad_s),
     };
     let effective = EffectiveTrack::measured(&turned.turn_blocks, calibration);

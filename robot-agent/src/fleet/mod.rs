@@ -74,7 +74,7 @@ pub struct Identity {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LinkEvent {
     /// A message of the server arrived: its pulse, or a command.
-    ServerHeard,
+    ServerMessage,
     /// A command was dropped because the queue was full; the server repeats it.
     CommandLost,
     /// The server is not reachable any more.
@@ -315,7 +315,7 @@ impl FleetLink {
             if run.is_some_and(|run| run != own_run) {
                 return;
             }
-            on_event(LinkEvent::ServerHeard);
+            on_event(LinkEvent::ServerMessage);
             let Some(Key::Command(_, _, verb)) = Key::parse(query.key_expr().as_str()) else {
                 // A wildcard or an unknown verb: no reply, which means not delivered.
                 return;
@@ -416,7 +416,7 @@ impl FleetLink {
         session
             .declare_subscriber(keys::pulse(site))
             .callback(move |sample| {
-                on_event(LinkEvent::ServerHeard);
+                on_event(LinkEvent::ServerMessage);
                 let pulse = wire::decode::<ServerPulse>(&small(sample.payload()));
                 if let Ok(Some(trust)) = pulse.map(|pulse| pulse.trust) {
                     on_event(LinkEvent::Trust(trust));

@@ -1,13 +1,13 @@
 //! Which of several servers the agent connects to next.
 //!
-//! The agent stays with the server that it reached. When that one falls silent, or an attempt to reach
-//! it fails, the next of the list is tried, and after the last one the first. There is no way back to a
-//! preferred server while the present one answers: robots would move twice for each restart.
+//! The agent stays connected to the server that it has reached. If that server falls silent, or an attempt to
+//! reach it fails, the agent tries the next one of the list, and the first after the last. It does not return
+//! to a preferred server while the present one answers: otherwise it would move twice for each restart.
 //!
-//! A server that is gone refuses at once, while one that is frozen or cut off takes seconds of each attempt.
-//! So the others are tried in parallel with an attempt that takes longer, and whichever is reached first is the one, as
-//! for the addresses of a host (RFC 8305). One that fell silent, or took long to fail, is passed over for a
-//! while.
+//! A server that is not running refuses a connection at once; an attempt to reach one that is frozen or cut off
+//! takes seconds. The agent therefore tries the others in parallel with a slow attempt, and uses the server
+//! that it reaches first (as RFC 8305 does for the addresses of a host). It skips a server that fell silent, or
+//! failed slowly, for some time.
 
 use std::time::Duration;
 
@@ -19,16 +19,16 @@ const PAUSE_MAX: Duration = Duration::from_millis(300);
 const DISTRUSTED_PAUSE_MAX: Duration = Duration::from_secs(10);
 
 /// Time for which a server is passed over that fell silent: it may be a gap of the radio alone.
-const LEFT_FOR: Duration = Duration::from_millis(300);
+const SKIP_AFTER_SILENCE: Duration = Duration::from_millis(300);
 /// Time for which a server is passed over that took long to fail.
-const PASSED_OVER: Duration = Duration::from_secs(5);
+const SKIP_AFTER_SLOW_FAILURE: Duration = Duration::from_secs(5);
 /// Duration of an attempt from which it counts as long.
 const LONG: Duration = Duration::from_secs(1);
 /// Duration of an attempt after which the next server is tried in parallel (the connection attempt delay of RFC 8305), and the pause between two attempts
 /// to reach that one.
 const ATTEMPT_DELAY: Duration = Duration::from_millis(200);
 
-/// What was logged about a server since it was reached last.
+/// Problems that were logged about a server since it was reached last.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Logged {
     /// That the robot does not trust its authority.
@@ -43,16 +43,16 @@ pub struct Server {
     pub(super) endpoint: String,
     pub(super) logged: Logged,
     /// Until when it is passed over.
-    passed_over_until: Duration,
+    skipped_until: Duration,
 }
 
 impl Server {
     /// Notes an attempt that failed.
     fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) {
         if is_distrusted {
-            self.passed_over_until = now + DISTRUSTED_PAUSE_MAX;
+            self.skipped_until = now + DISTRUSTED_PAUSE_MAX;
         } else if now.saturating_sub(began) >= LONG {
-            self.passed_over_until = now + PASSED_OVER;
+            self.skipped_until = now + SKIP_AFTER_SLOW_FAILURE;
         }
     }
 }
@@ -72,7 +72,7 @@ impl ParallelAttempt<'_> {
     /// Notes an attempt that failed at `now`.
     pub fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) {
         self.server.failed((began, now), is_distrusted);
-        let passed_over = self.server.passed_over_until.saturating_sub(now);
+        let passed_over = self.server.skipped_until.saturating_sub(now);
         self.pause = passed_over.max(ATTEMPT_DELAY);
     }
 }
@@ -124,7 +124,7 @@ impl Rotation {
         let after = after.map(|(step, server)| (self.at + 1 + step, server));
         let others = after.chain(before.iter_mut().enumerate());
         let parallel = others.zip(1..).map(|((at, server), turn)| {
-            let passed_over = server.passed_over_until.saturating_sub(now);
+            let passed_over = server.skipped_until.saturating_sub(now);
             let pause = passed_over.max(turn * ATTEMPT_DELAY);
             ParallelAttempt { at, server, pause }
         });
@@ -140,14 +140,14 @@ impl Rotation {
     pub fn reached(&mut self) {
         let server = &mut self.servers[self.at];
         server.logged = Logged::default();
-        server.passed_over_until = Duration::ZERO;
+        server.skipped_until = Duration::ZERO;
         self.is_distrusted = true;
         self.pause = PAUSE_FIRST;
     }
 
     /// Goes on to the next server, since the present one fell silent before `now`.
     pub fn leave(&mut self, now: Duration) {
-        self.servers[self.at].passed_over_until = now + LEFT_FOR;
+        self.servers[self.at].skipped_until = now + SKIP_AFTER_SILENCE;
         self.next(now);
     }
 
@@ -155,7 +155,7 @@ impl Rotation {
     pub fn reset_failures(&mut self) {
         for server in &mut self.servers {
             server.logged = Logged::default();
-            server.passed_over_until = Duration::ZERO;
+            server.skipped_until = Duration::ZERO;
         }
     }
 
@@ -183,7 +183,7 @@ impl Rotation {
     fn next(&mut self, now: Duration) -> bool {
         let (count, before) = (self.servers.len(), self.at);
         let following = (1..=count).map(|step| (before + step) % count);
-        let remaining = |at: &usize| self.servers[*at].passed_over_until.saturating_sub(now);
+        let remaining = |at: &usize| self.servers[*at].skipped_until.saturating_sub(now);
         self.at = following.min_by_key(remaining).unwrap_or(before);
         self.at <= before
     }
@@ -236,7 +236,7 @@ mod tests {
         let (tried, pauses) = attempts(&mut rotation, &mut now, &[0.1; 5]);
         assert_eq!(tried, "11010");
         assert_eq!(pauses, [100, 200, 0, 300, 0]);
-        now += PASSED_OVER;
+        now += SKIP_AFTER_SLOW_FAILURE;
         // The first takes long, and then the other one does: the first will be tried again sooner.
         let (tried, _) = attempts(
             &mut rotation,
@@ -270,7 +270,7 @@ mod tests {
         others[1].failed((now, now + LONG), false);
         let pauses = others.iter().map(|attempt| attempt.pause);
         let pauses: Vec<_> = pauses.collect();
-        assert_eq!(pauses, [DISTRUSTED_PAUSE_MAX, PASSED_OVER]);
+        assert_eq!(pauses, [DISTRUSTED_PAUSE_MAX, SKIP_AFTER_SLOW_FAILURE]);
         assert_eq!(parallel(&mut rotation, now), [(2, 10_000), (0, 6_000)]);
         rotation.select(2);
         rotation.reached();
@@ -313,7 +313,7 @@ mod tests {
                 }
             }
             rotation.reached();
-            now += 2 * PASSED_OVER;
+            now += 2 * SKIP_AFTER_SLOW_FAILURE;
             let mut tried = BTreeSet::new();
             let mut pauses = 0;
             for _ in 0..count {

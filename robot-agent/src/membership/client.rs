@@ -98,21 +98,21 @@ pub async fn enrol(enrolment: &Enrolment, now: Timestamp) -> Result<Membership, 
         robot: enrolment.robot.clone(),
         certificate_request: request,
     };
-    let got = post(&url, (&enrolment.trust, None), "v1/enrolments", &body).await?;
+    let answer = post(&url, (&enrolment.trust, None), "v1/enrolments", &body).await?;
     let host = url.host_str().unwrap_or_default();
-    let own = || format!("tls/{host}:{}", got.port);
+    let default_endpoint = || format!("tls/{host}:{}", answer.port);
     Ok(Membership {
-        endpoint: enrolment.endpoint.clone().unwrap_or_else(own),
-        site: got.site,
-        robot: got.robot,
-        enrolment: got.enrolment,
-        certificate: got.certificate,
+        endpoint: enrolment.endpoint.clone().unwrap_or_else(default_endpoint),
+        site: answer.site,
+        robot: answer.robot,
+        enrolment: answer.enrolment,
+        certificate: answer.certificate,
         key: key.serialize_pem(),
-        authority: got.authority,
+        authority: answer.authority,
         server: enrolment.server.clone(),
         trust: enrolment.trust.clone(),
         issued_at: now,
-        lifetime_s: got.lifetime_s,
+        lifetime_s: answer.lifetime_s,
     })
 }
 
@@ -134,13 +134,13 @@ impl Membership {
             proof: BASE64_STANDARD.encode(proof),
         };
         let trust = (&self.trust, Some(self.authority.as_str()));
-        let got = post(&url, trust, "v1/enrolments/renew", &body).await?;
+        let answer = post(&url, trust, "v1/enrolments/renew", &body).await?;
         Ok(Self {
-            certificate: got.certificate,
+            certificate: answer.certificate,
             key: next.serialize_pem(),
-            authority: got.authority,
+            authority: answer.authority,
             issued_at: now,
-            lifetime_s: got.lifetime_s,
+            lifetime_s: answer.lifetime_s,
             ..self.clone()
         })
     }

@@ -28,7 +28,7 @@ const JITTER_MAX: Duration = Duration::from_secs(5);
 pub(crate) enum ServerTrust {
     /// None so far.
     #[default]
-    Unheard,
+    Unknown,
     /// Identifier stated by the server, over a mutually authenticated link.
     Is(TrustId),
     /// The robots' port shows a certificate of an authority that this robot does not trust.
@@ -47,13 +47,13 @@ enum Due {
 }
 
 /// Decides the next action.
-fn due(present: &Membership, heard: ServerTrust, now: Timestamp) -> Due {
+fn due(present: &Membership, server_trust: ServerTrust, now: Timestamp) -> Due {
     let left = present.renewal_due_in(now);
     if left == Duration::ZERO {
         return Due::Now;
     }
-    match heard {
-        ServerTrust::Unheard => Due::In(left),
+    match server_trust {
+        ServerTrust::Unknown => Due::In(left),
         ServerTrust::Is(trust) if present.trust_id() == Some(trust) => Due::In(left),
         ServerTrust::Is(_) | ServerTrust::Distrusted => Due::OtherTrust,
     }
@@ -72,7 +72,7 @@ pub(crate) struct Renewal {
     pub(crate) folder: PathBuf,
     pub(crate) clock: SharedClock,
     pub(crate) present: watch::Sender<Arc<Membership>>,
-    pub(crate) heard: watch::Sender<ServerTrust>,
+    pub(crate) server_trust: watch::Sender<ServerTrust>,
 }
 
 impl Renewal {
@@ -89,16 +89,16 @@ impl Renewal {
         let mut is_first = true;
         // An impostor at the port may show another certificate indefinitely.
         let mut distrust_backoff = Duration::ZERO;
-        let mut news = self.heard.subscribe();
+        let mut trust_changes = self.server_trust.subscribe();
         loop {
             let present = Arc::clone(&self.present.borrow());
-            let heard = *news.borrow_and_update();
-            match due(&present, heard, self.clock.wall()) {
+            let server_trust = *trust_changes.borrow_and_update();
+            match due(&present, server_trust, self.clock.wall()) {
                 Due::In(left) => {
                     (pause, is_first) = (RETRY_FIRST, true);
                     tokio::select! {
                         () = tokio::time::sleep(left.min(CHECK_EVERY)) => {}
-                        _ = news.changed() => {}
+                        _ = trust_changes.changed() => {}
                     }
                     continue;
                 }
@@ -108,7 +108,7 @@ impl Renewal {
                     is_first = false;
                     continue;
                 }
-                Due::OtherTrust if heard == ServerTrust::Distrusted => {
+                Due::OtherTrust if server_trust == ServerTrust::Distrusted => {
                     tokio::time::sleep(distrust_backoff).await;
                 }
                 Due::Now | Due::OtherTrust => {}
@@ -116,10 +116,10 @@ impl Renewal {
             match self.renew(&present).await {
                 Ok(()) => {
                     // The port's certificate was checked against the former membership.
-                    self.heard.send_if_modified(|heard| {
-                        let was_distrusted = *heard == ServerTrust::Distrusted;
+                    self.server_trust.send_if_modified(|server_trust| {
+                        let was_distrusted = *server_trust == ServerTrust::Distrusted;
                         if was_distrusted {
-                            *heard = ServerTrust::Unheard;
+                            *server_trust = ServerTrust::Unknown;
                         }
                         was_distrusted
                     });
@@ -131,8 +131,8 @@ impl Renewal {
                     } else {
                         Duration::ZERO
                     };
-                    let heard = *self.heard.borrow();
-                    if matches!(due(&present, heard, self.clock.wall()), Due::In(_)) {
+                    let server_trust = *self.server_trust.borrow();
+                    if matches!(due(&present, server_trust, self.clock.wall()), Due::In(_)) {
                         continue;
                     }
                 }
@@ -142,7 +142,7 @@ impl Renewal {
                         "the certificate was not renewed; another try in {} s",
                         pause.as_secs()
                     );
-                    if heard == ServerTrust::Distrusted && is_refusal(&*cause) {
+                    if server_trust == ServerTrust::Distrusted && is_refusal(&*cause) {
                         error!(
                             "the fleet's authority is another one than this robot trusts, and the \
                              server gives no certificate for the present one: it was changed while \
@@ -218,18 +218,22 @@ mod tests {
         let id = |membership: &Membership| ServerTrust::Is(membership.trust_id().unwrap());
         let now = old.issued_at;
         let in_time = Due::In(Duration::from_mins(1));
-        for (present, heard, expected) in [
-            (&old, ServerTrust::Unheard, in_time),
+        for (present, server_trust, expected) in [
+            (&old, ServerTrust::Unknown, in_time),
             (&old, id(&old), in_time),
             (&both, id(&turned), in_time),
             (&old, id(&both), Due::OtherTrust),
             (&both, id(&trusting(next)), Due::OtherTrust),
             (&old, ServerTrust::Distrusted, Due::OtherTrust),
         ] {
-            assert_eq!(due(present, heard, now), expected, "{heard:?}");
+            assert_eq!(
+                due(present, server_trust, now),
+                expected,
+                "{server_trust:?}"
+            );
         }
         let late = now + Duration::from_mins(1);
-        assert_eq!(due(&old, ServerTrust::Unheard, late), Due::Now);
+        assert_eq!(due(&old, ServerTrust::Unknown, late), Due::Now);
     }
 
     #[test]

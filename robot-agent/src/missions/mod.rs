@@ -128,9 +128,12 @@ impl MissionSlot {
     }
 
     /// Returns how missions ended here, for a server that does not know.
-    pub fn outcomes(&self, asked: &[MissionId]) -> MissionOutcomes {
-        let asked: HashSet<MissionId> = asked.iter().copied().collect();
-        let ended = self.ended.iter().filter(|it| asked.contains(&it.mission));
+    pub fn outcomes(&self, requested: &[MissionId]) -> MissionOutcomes {
+        let requested: HashSet<MissionId> = requested.iter().copied().collect();
+        let ended = self
+            .ended
+            .iter()
+            .filter(|it| requested.contains(&it.mission));
         let ended = ended.map(|&Ended { mission, phase }| EndedMission { mission, phase });
         let accepted = |active: &ActiveMission| AcceptedMission {
             mission: active.mission,

@@ -62,7 +62,7 @@ pub(super) struct Scan {
     next_ordinal: u64,
     bytes: usize,
     /// Ranges without an intact frame.
-    spoilt: Vec<Range<usize>>,
+    damaged_ranges: Vec<Range<usize>>,
 }
 
 impl Scan {
@@ -76,17 +76,17 @@ impl Scan {
             head: None,
             next_ordinal: ordinals.start.max(first_ordinal),
             bytes: bytes.len(),
-            spoilt: Vec::new(),
+            damaged_ranges: Vec::new(),
         };
         let mut at = 0;
         while at < bytes.len() {
             let expected = scan.next_ordinal..ordinals.end;
             let Some((found_at, frame, length)) = frame::find(&bytes, at, &expected) else {
-                scan.spoilt.push(at..bytes.len());
+                scan.damaged_ranges.push(at..bytes.len());
                 break;
             };
             if found_at > at {
-                scan.spoilt.push(at..found_at);
+                scan.damaged_ranges.push(at..found_at);
             }
             match frame {
                 Frame::Record(name, content) => {
@@ -114,12 +114,12 @@ impl Scan {
         damaged: &mut DamagedBytes,
         recovery: &mut Recovery,
     ) -> Result<u64, StoreError> {
-        if self.spoilt.is_empty() {
+        if self.damaged_ranges.is_empty() {
             return Ok(size(self.bytes));
         }
         let path = &self.path;
         let bytes = read_file(path).map_err(failure("read", path))?;
-        for span in &self.spoilt {
+        for span in &self.damaged_ranges {
             if is_tail_torn && span.end == self.bytes {
                 recovery.torn_bytes += size(span.len());
                 continue;
@@ -135,13 +135,14 @@ impl Scan {
                 tracing::error!("the damaged bytes are not kept: {cause}");
             }
         }
-        let spoilt_bytes: usize = self.spoilt.iter().map(Range::len).sum();
-        let intact_bytes = self.bytes - spoilt_bytes;
+        let damaged_bytes: usize = self.damaged_ranges.iter().map(Range::len).sum();
+        let intact_bytes = self.bytes - damaged_bytes;
         if intact_bytes == 0 {
             fs::remove_file(path).map_err(failure("remove", path))?;
             return Ok(0);
         }
-        let is_tail_alone = self.spoilt.len() == 1 && self.spoilt[0].end == self.bytes;
+        let is_tail_alone =
+            self.damaged_ranges.len() == 1 && self.damaged_ranges[0].end == self.bytes;
         if is_tail_alone {
             let file = File::options().write(true).open(path);
             let cut = file.and_then(|file| file.set_len(size(intact_bytes)));
@@ -150,7 +151,7 @@ impl Scan {
         }
         let mut intact = Vec::with_capacity(intact_bytes);
         let mut from = 0;
-        for span in &self.spoilt {
+        for span in &self.damaged_ranges {
             intact.extend_from_slice(&bytes[from..span.start]);
             from = span.end;
         }
@@ -163,7 +164,10 @@ impl Scan {
             durable::replace(folder, name, &intact).map_err(failure("repair", path))?;
         }
         for record in &mut self.records {
-            let before = self.spoilt.iter().filter(|span| span.end <= record.at);
+            let before = self
+                .damaged_ranges
+                .iter()
+                .filter(|span| span.end <= record.at);
             record.at -= before.map(Range::len).sum::<usize>();
         }
         Ok(size(intact_bytes))

@@ -65,7 +65,7 @@ pub(crate) struct Replayed {
     pub(crate) differing: u64,
     /// The first differing ticks, at most [`REPORTED_MAX`].
     pub(crate) first_differing: Vec<DifferingTick>,
-    /// What is missing in the record; nothing after it could be replayed.
+    /// Description of a gap in the record; the replay ends at the first gap.
     pub(crate) gap: Option<String>,
     /// Where the record is torn; the replay ends there.
     pub(crate) torn: Option<String>,
@@ -145,7 +145,7 @@ impl Replayer {
     fn new(head: RunHead) -> Result<Self, ReplayError> {
         let model = control_model(&head.model)?;
         let (loop_ends, ends) = loop_channels();
-        let (taker, notes) = notes();
+        let (record_sender, notes) = notes();
         let mut core = LoopCore::new(model, loop_ends)
             .with_blind_within_fence(head.blind_within_fence)
             .with_silent_after(head.silent_after)
@@ -156,7 +156,7 @@ impl Replayer {
         {
             core = core.with_period(period);
         }
-        core.record_to(Some(taker));
+        core.record_to(Some(record_sender));
         Ok(Self {
             model,
             core,
@@ -228,7 +228,7 @@ impl Replayer {
         let shared = &self.ends.shared;
         shared.safety.show(recorded.stop, &self.view);
         let silence = Duration::from_nanos(recorded.server_silence_ns);
-        shared.replay_server_heard(now.monotonic.saturating_sub(silence));
+        shared.replay_server_message(now.monotonic.saturating_sub(silence));
         let judged = Duration::from_nanos(recorded.judged_ns);
         let stop = has(tick_bits::STOP_REQUESTED);
         self.core.tick_by(now, &|| judged, stop, &mut base);

@@ -210,11 +210,11 @@ fn chunk_at(bytes: &[u8], at: usize) -> Option<(Range<usize>, Chunk)> {
     let mut chunk = Chunk::default();
     while let Some(event) = reader.next_event() {
         match event.ok()? {
-            LinearReadEvent::ReadRequest(wanted) => {
-                let (next, behind) = rest.split_at(wanted.min(rest.len()));
+            LinearReadEvent::ReadRequest(length) => {
+                let (next, after) = rest.split_at(length.min(rest.len()));
                 reader.insert(next.len()).copy_from_slice(next);
                 reader.notify_read(next.len());
-                rest = behind;
+                rest = after;
             }
             LinearReadEvent::Record { data, opcode } => {
                 chunk.take(parse_record(opcode, data).ok()?);

@@ -126,7 +126,7 @@ fn a_mission_is_shown_from_its_plan_to_the_way_driven_in_the_robots_frame() {
     }
     assert!((2..=3).contains(&times), "{times} times in three seconds");
 
-    let messages = said(&mut outward, bench.now + SAY_EVERY);
+    let messages = said(&mut outward, bench.now + PUBLISH_PERIOD);
     let driven = points(&messages, PublishedTopic::Driven);
     let snapshot = shared.snapshot();
     let (pose, _) = snapshot.pose.unwrap();
@@ -209,14 +209,14 @@ fn what_is_wrong_is_said_and_is_over_when_it_is() {
     let (_, text, values) = part(&messages, "tread_agent: base");
     assert_eq!(text, "messages dropped of late: 1");
     assert_eq!(values["imu: late"], "1");
-    let messages = said(&mut outward, now + SILENT_SERVER + SAY_EVERY);
+    let messages = said(&mut outward, now + SILENT_SERVER + PUBLISH_PERIOD);
     let (level, _, values) = part(&messages, "tread_agent: base");
     assert_eq!(
         (level, values["imu: late"].as_str()),
         (Level::Ok as u8, "1")
     );
     outward.counts.count_foreign_command();
-    let messages = said(&mut outward, now + SILENT_SERVER + 2 * SAY_EVERY);
+    let messages = said(&mut outward, now + SILENT_SERVER + 2 * PUBLISH_PERIOD);
     let (level, text, values) = part(&messages, "tread_agent: base");
     assert_eq!(level, Level::Error as u8, "{text}");
     assert_eq!(values["commands of others"], "1");

@@ -39,7 +39,7 @@ use stop::{ClearRefusal, StopState};
 /// Longest wait for the loop to set its target to zero; the stop is then answered as unconfirmed.
 pub(crate) const ZERO_WAIT_MAX: Duration = Duration::from_millis(500);
 /// Interval of the checks whether the loop has set its target to zero.
-const ZERO_LOOK_EVERY: Duration = Duration::from_millis(1);
+const ZERO_POLL_EVERY: Duration = Duration::from_millis(1);
 
 /// Returns the time in whole microseconds.
 pub(crate) fn microseconds(at: Duration) -> u64 {
@@ -207,7 +207,7 @@ impl Safety {
         let zeroing = async {
             // A stop that was cleared meanwhile counts as confirmed.
             while self.cell.stop() != 0 && self.cell.zeroed.load(Ordering::Acquire) < number {
-                tokio::time::sleep(ZERO_LOOK_EVERY).await;
+                tokio::time::sleep(ZERO_POLL_EVERY).await;
             }
         };
         let zeroing = tokio::time::timeout(ZERO_WAIT_MAX, zeroing);

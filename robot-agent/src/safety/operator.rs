@@ -237,11 +237,11 @@ impl Operator {
         if verdict != Verdict::Accepted {
             return verdict;
         }
-        let asked = Twist {
+        let requested = Twist {
             linear_m_s: command.twist.linear_m_s,
             angular_rad_s: command.twist.angular_rad_s,
         };
-        let (within, is_over) = within_limits(asked, &self.model);
+        let (within, is_over) = within_limits(requested, &self.model);
         self.counts.over_limit += u64::from(is_over);
         self.wanted = Some((within, command.until_us));
         let age_us = now_us.saturating_sub(command.sent_us);

@@ -14,13 +14,13 @@ struct Patch {
     outline: Polygon,
     curve: FrictionCurve,
     /// Later friction curves with the time of each change, in order of time.
-    then: Vec<(Duration, FrictionCurve)>,
+    changes: Vec<(Duration, FrictionCurve)>,
 }
 
 impl Patch {
     fn curve(&self, at: Duration) -> FrictionCurve {
-        let begun = self.then.partition_point(|(from, _)| *from <= at);
-        let last = begun.checked_sub(1).and_then(|last| self.then.get(last));
+        let begun = self.changes.partition_point(|(from, _)| *from <= at);
+        let last = begun.checked_sub(1).and_then(|last| self.changes.get(last));
         last.map_or(self.curve, |(_, curve)| *curve)
     }
 }
@@ -55,15 +55,15 @@ impl GroundMap {
         for terrain in terrains {
             let outline = terrain.outline().map_err(malformed)?;
             let curve = |ground: GroundSpec| {
-                let felt = GroundSpec {
+                let for_robot = GroundSpec {
                     stiffness: ground.stiffness * stiffness_ratio,
                     ..ground
                 };
-                felt.curve().map_err(malformed)
+                for_robot.curve().map_err(malformed)
             };
-            let mut then = Vec::with_capacity(terrain.then.len());
+            let mut changes = Vec::with_capacity(terrain.then.len());
             for change in &terrain.then {
-                then.push((
+                changes.push((
                     Duration::from_secs_f64(change.after_s),
                     curve(change.ground())?,
                 ));
@@ -71,7 +71,7 @@ impl GroundMap {
             patches.push(Patch {
                 outline,
                 curve: curve(terrain.ground())?,
-                then,
+                changes,
             });
         }
         let elsewhere = GroundSpec {
@@ -84,11 +84,11 @@ impl GroundMap {
 
     fn curve(&self, (x_m, y_m): (f64, f64), at: Duration) -> FrictionCurve {
         let point = Point { x_m, y_m };
-        let hit = self
+        let patch = self
             .patches
             .iter()
             .find(|patch| patch.outline.contains(point));
-        hit.map_or(self.elsewhere, |patch| patch.curve(at))
+        patch.map_or(self.elsewhere, |patch| patch.curve(at))
     }
 
     /// Returns the ground under both sides of a robot at a time of its clock, half a track width to

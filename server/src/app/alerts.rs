@@ -154,8 +154,12 @@ impl App {
 
     /// Returns false if the robot is not known yet, or if its allowance did not cover all new
     /// alerts.
-    async fn sync_alerts_of(&self, key: &RobotKey, said: &[AlertReport]) -> Result<bool, AppError> {
-        let said = &said[..said.len().min(ALERTS_MAX)];
+    async fn sync_alerts_of(
+        &self,
+        key: &RobotKey,
+        reported: &[AlertReport],
+    ) -> Result<bool, AppError> {
+        let reported = &reported[..reported.len().min(ALERTS_MAX)];
         let mut tx = self.db().read("alerts").await?;
         let Some(site) = db::sites::find(&mut tx, &key.0).await? else {
             return Ok(false);
@@ -165,15 +169,15 @@ impl App {
         };
         let raised = db::alerts::raised_of(&mut tx, robot.pk).await?;
         drop(tx);
-        let has = |alert: &Alert| said.iter().any(|report| report.code == alert.code);
+        let has = |alert: &Alert| reported.iter().any(|report| report.code == alert.code);
         let is_new = |report: &&AlertReport| !raised.iter().any(|alert| alert.code == report.code);
         // A robot cannot clear an alert that the server itself raised.
         let own = |alert: &&Alert| OWN_ALERTS.contains(&alert.code.as_str());
-        let gone = raised.iter().filter(|alert| !has(alert) && !own(alert));
-        let gone: Vec<&Alert> = gone.collect();
+        let ended = raised.iter().filter(|alert| !has(alert) && !own(alert));
+        let ended: Vec<&Alert> = ended.collect();
         // An alert beyond the allowance is tried again until it is raised or no longer reported.
         let (mut new, mut has_all) = (Vec::new(), true);
-        for report in said.iter().filter(is_new) {
+        for report in reported.iter().filter(is_new) {
             let elapsed = self.clock().elapsed();
             if self.allowances().take_alert(key, &report.code, elapsed) {
                 new.push(report);
@@ -181,12 +185,12 @@ impl App {
                 has_all = false;
             }
         }
-        if gone.is_empty() && new.is_empty() {
+        if ended.is_empty() && new.is_empty() {
             return Ok(has_all);
         }
         let mut alerts = Vec::new();
         let mut tx = self.db().write_uncounted("alerts").await?;
-        for alert in gone {
+        for alert in ended {
             let ended = self.end(&mut tx, robot.pk, alert).await?;
             alerts.extend(ended);
         }

@@ -230,8 +230,8 @@ impl App {
         self.write_file(archive, KeyRange { first, last }).await
     }
 
-    /// Returns the last key of a file that begins with the first measurement that is due: that of the
-    /// last whole day, UTC, that fits into a file. `None` if no day is due as a whole.
+    /// Returns the last key of the next file, which begins at the first key of `due`: the end of the last
+    /// UTC day that is due as a whole and fits into a file. `None` if no whole day is due.
     async fn end_of_file(&self, due: KeyRange, rows_max: u32) -> Result<Option<i64>, AppError> {
         let most = due.first.saturating_add(i64::from(rows_max)) - 1;
         let end = due.last.min(most);

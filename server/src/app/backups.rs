@@ -1,13 +1,12 @@
-//! Backups of the database and of the fleet's authority: one on demand, and those that the server
-//! makes by itself.
+//! Backups of the database and of the fleet's authority, on demand and on a schedule.
 //!
 //! ```text
 //! free space? ─► copy beside the database ─► read the copy ─► archive at the target ─► read it back
 //! ```
 //!
-//! The copy is made by SQLite's `VACUUM INTO`: one read transaction, beside whoever writes. It lies
-//! beside the database, where its content may be in clear text, until it is in the archive. One
-//! backup of a database is made at a time, whichever process makes it.
+//! SQLite's `VACUUM INTO` makes the copy in one read transaction, while others may write. The copy is
+//! in the database's folder, where its content may be in clear text, until it is in the archive. A
+//! lock permits one backup of a database at a time, also if several processes request one.
 
 mod schedule;
 
@@ -202,11 +201,11 @@ fn check_all_space(order: &Order, target: &Path, size: u64) -> Result<(), Backup
     check_space(there, size.saturating_add(TARGET_RESERVE_BYTES))
 }
 
-/// Makes a backup: copies the database beside whoever writes it, checks the copy, and writes the
-/// archive. Memory does not grow with the database.
+/// Makes a backup: copies the database while others may write to it, checks the copy, and writes the
+/// archive. The memory used does not depend on the size of the database.
 ///
 /// # Errors
-/// [`BackupError`]; nothing is left behind.
+/// [`BackupError`]; all files of the attempt are removed.
 pub async fn make(
     order: Order,
     progress: impl Fn(Progress) + Send + Sync + 'static,

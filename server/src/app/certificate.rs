@@ -24,7 +24,7 @@ impl App {
     }
 }
 
-/// Returns what is wrong with a certificate, for people; `None` if nothing is.
+/// Returns a description of a certificate's problem; `None` if it has none.
 fn problem(
     certificate: &Certificate,
     origin: &str,

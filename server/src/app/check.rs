@@ -116,7 +116,7 @@ impl App {
             None => self.expected_start((&site, &robot), &trajectory),
         };
         let presence = self.presences().get(&(site.clone(), robot.clone()));
-        let measured = presence.friction().and_then(|said| said.theta_measured);
+        let measured = presence.friction().and_then(|report| report.theta_measured);
         let ground = AssumedGround {
             theta: theta
                 .or(measured.map(|measured| measured.theta))
@@ -128,11 +128,11 @@ impl App {
         let model = row.model;
         let checking = move || {
             let start = after(first, &before, &model);
-            let asked = Planning {
+            let planning = Planning {
                 trajectory: &trajectory,
                 traction: &traction,
             };
-            check(&model, asked, start, ground, &fence)
+            check(&model, planning, start, ground, &fence)
         };
         match tokio::task::spawn_blocking(checking).await {
             Ok(checked) => checked.map_err(|refused| refused.of(robot)),
@@ -181,11 +181,11 @@ impl App {
         let trajectory = trajectory.clone();
         let checking = move || {
             let start = after(first, &before, &row.model);
-            let asked = Planning {
+            let planning = Planning {
                 trajectory: &trajectory,
                 traction: &traction,
             };
-            match planned(&row.model, asked, start.pose) {
+            match planned(&row.model, planning, start.pose) {
                 Ok(planned) => fenced(&planned, &trajectory, &fence),
                 // A trajectory that cannot be planned is refused by the robot.
                 Err(_impossible) => Ok(()),
@@ -315,13 +315,13 @@ pub(super) fn planned(
 
 fn check(
     model: &RobotModel,
-    asked: Planning<'_>,
+    planning: Planning<'_>,
     start: Start,
     ground: AssumedGround,
     fence: &Fence,
 ) -> Result<TrajectoryCheck, Refused> {
-    let planned = planned(model, asked, start.pose)?;
-    let trajectory = asked.trajectory;
+    let planned = planned(model, planning, start.pose)?;
+    let trajectory = planning.trajectory;
     let begin = trajectory.options().planning_start(start.pose);
     fenced(&planned, trajectory, fence)?;
     let plan = &planned.plan;

@@ -9,7 +9,7 @@ use super::App;
 use crate::db;
 
 /// Interval between two checkpoints.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
+const CHECKPOINT_EVERY: Duration = Duration::from_millis(250);
 
 /// Checkpoints the log periodically until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
@@ -19,7 +19,7 @@ pub async fn run(app: App, stop: CancellationToken) {
         }
         tokio::select! {
             () = stop.cancelled() => {}
-            () = tokio::time::sleep(LOOK_EVERY) => {}
+            () = tokio::time::sleep(CHECKPOINT_EVERY) => {}
         }
     }
 }

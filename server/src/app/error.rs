@@ -53,15 +53,15 @@ pub enum AppError {
         /// How it ended.
         state: MissionState,
     },
-    /// The mission's state does not allow what is asked.
-    #[error("mission `{id}` is {} and cannot be {asked} now", state.as_str())]
+    /// The mission's state does not permit the requested action.
+    #[error("mission `{id}` is {} and cannot be {action} now", state.as_str())]
     MissionState {
         /// The mission.
         id: MissionId,
         /// Its present state.
         state: MissionState,
         /// The requested change.
-        asked: &'static str,
+        action: &'static str,
     },
     /// The robot has another open mission, and the start policy does not allow to wait.
     #[error("robot `{robot}` has mission `{mission}`, which is {}", state.as_str())]

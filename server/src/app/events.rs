@@ -126,9 +126,10 @@ impl App {
         self.inner.event_shares.take(of, "event clients")
     }
 
-    /// Subscribes a client: what it missed since its last event, or a snapshot, comes first.
+    /// Subscribes a client. It first gets the events since `last`, or a snapshot if these are not
+    /// available.
     ///
-    /// `cut` is cancelled when the client is dropped and does not read its end.
+    /// `cut` is cancelled if the client is dropped and does not read the event that tells it so.
     ///
     /// # Errors
     /// [`AppError::TooMany`] beyond [`CLIENTS_MAX`] clients, or the database failed.
@@ -216,7 +217,7 @@ impl App {
         filter: &EventFilter,
     ) -> Result<VecDeque<Arc<Sent>>, AppError> {
         let read = self.hub().read_elsewhere(last);
-        let Some((run, at)) = read.filter(|_| filter.wants(Topic::Missions)) else {
+        let Some((run, at)) = read.filter(|_| filter.includes_topic(Topic::Missions)) else {
             return Ok(VecDeque::new());
         };
         let after = at.step.max(until - i64::from(STEPS_MISSED_MAX));
@@ -232,8 +233,8 @@ impl App {
                 ..unnumbered(&event, Some(Topic::Missions), about)
             }
         });
-        let wanted = |step: &Sent| filter.matches(step.topic, step.about.as_ref());
-        Ok(missed.filter(wanted).map(Arc::new).collect())
+        let matches = |step: &Sent| filter.matches(step.topic, step.about.as_ref());
+        Ok(missed.filter(matches).map(Arc::new).collect())
     }
 
     /// Returns the first name in a filter that is not known, with its query parameter.

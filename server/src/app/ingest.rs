@@ -255,7 +255,7 @@ impl Writer {
 
     /// Converts a time of the robot's wall clock to the server's, accurate to a few milliseconds;
     /// `None` unless the batch is of the robot's present run.
-    fn heard_of(&self, upload: &Upload, at: Timestamp) -> Option<Timestamp> {
+    fn to_server_time(&self, upload: &Upload, at: Timestamp) -> Option<Timestamp> {
         let key = (upload.site.clone(), upload.batch.robot.clone());
         let presence = self.app.presences().get(&key);
         let (boot, _since) = presence.boot()?;
@@ -274,7 +274,9 @@ impl Writer {
         (now, skew): (Timestamp, Skew),
     ) -> Reporting {
         let at = skew.corrected(report.at);
-        let since = report.since.and_then(|since| self.heard_of(upload, since));
+        let since = report
+            .since
+            .and_then(|since| self.to_server_time(upload, since));
         let key = (upload.site.clone(), upload.batch.robot.clone());
         Reporting {
             robot_pk,

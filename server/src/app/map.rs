@@ -192,11 +192,11 @@ impl Maps {
     }
 
     /// Reads a site's map; an empty one if it does not exist.
-    pub(super) fn with_map<T>(&self, row: &SiteRow, look: impl FnOnce(&SiteMap) -> T) -> T {
+    pub(super) fn with_map<T>(&self, row: &SiteRow, read: impl FnOnce(&SiteMap) -> T) -> T {
         let sites = self.sites.read().unwrap_or_else(PoisonError::into_inner);
         match sites.maps.get(&row.pk) {
-            Some(map) => look(map),
-            None => look(&SiteMap::new(row.site.grid.revision, row.horizons)),
+            Some(map) => read(map),
+            None => read(&SiteMap::new(row.site.grid.revision, row.horizons)),
         }
     }
 

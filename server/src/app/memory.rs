@@ -3,8 +3,8 @@
 //! ```text
 //!  commit ─► written ──────────────────► memory changes, in the same task
 //!         ├► nothing written ──────────► memory stays
-//!         └► SQLite did not answer ────► no sums change until that commit has ended, in whatever
-//!                                        way, and memory was read again
+//!         └► SQLite did not answer ────► no sums change until that commit has ended, with success or
+//!                                        not, and memory was read again
 //! ```
 
 use std::time::Duration;

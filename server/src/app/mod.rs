@@ -105,7 +105,7 @@ struct Inner {
     presences: Arc<Presences>,
     robots: RobotLink,
     commands: Commands,
-    /// Wakes the reconciler after a change of what is wanted or of what robots report.
+    /// Wakes the reconciler after a change of the desired state or of what robots report.
     changed: Notify,
     /// Wakes the feed of events.
     announced: Notify,
@@ -242,8 +242,12 @@ impl App {
         &self.inner.robots
     }
 
-    /// Starts a background task beside a request; it must end by itself.
-    pub fn pass_by(&self, name: &'static str, task: impl Future<Output = ()> + Send + 'static) {
+    /// Starts a background task that the request does not wait for. The task must be finite.
+    pub fn spawn_background(
+        &self,
+        name: &'static str,
+        task: impl Future<Output = ()> + Send + 'static,
+    ) {
         self.supervisor().spawn_passing(name, task);
     }
 

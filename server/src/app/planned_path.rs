@@ -35,11 +35,11 @@ impl App {
         let begin = mission.plan.and_then(|plan| plan.begin);
         let planning = move || {
             let begin = begin.unwrap_or_else(|| begin_of(&trajectory));
-            let asked = Planning {
+            let planning = Planning {
                 trajectory: &trajectory,
                 traction: &traction,
             };
-            let planned = planned(&model, asked, begin)?;
+            let planned = planned(&model, planning, begin)?;
             Ok(drawn(&planned.plan, &trajectory))
         };
         match tokio::task::spawn_blocking(planning).await {

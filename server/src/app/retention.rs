@@ -22,7 +22,7 @@ use crate::db;
 use crate::friction::epochs::DAY_H;
 
 /// Interval at which the server checks for measurements to remove.
-const LOOK_EVERY: Duration = Duration::from_mins(10);
+const CHECK_EVERY: Duration = Duration::from_mins(10);
 /// Maximum number of measurements removed in one transaction; other writers proceed in between.
 const REMOVED_MAX: u32 = 2_000;
 
@@ -53,7 +53,7 @@ pub async fn run(app: App, config: RetentionConfig, stop: CancellationToken) {
         }
         tokio::select! {
             () = stop.cancelled() => break,
-            () = tokio::time::sleep(LOOK_EVERY) => {}
+            () = tokio::time::sleep(CHECK_EVERY) => {}
         }
     }
 }

@@ -1,21 +1,21 @@
 //! Stops: of one robot or of a fleet, and their clearing.
 //!
 //! ```text
-//! asked ─┬─► every robot at once ─► confirmed ──────────────┐
-//!        └─► the database, beside ─► not confirmed in 300 ms: shown, an alert, ─► sent again
-//!                                    by the reconciler until the robot confirms, over restarts
-//! the robot's state ─► standstill, measured: recorded by the reconciler
+//! request ─┬─► sent to every robot at once ─► confirmed
+//!          └─► stored at the same time ─► not confirmed within 300 ms: shown, raises an alert, and
+//!                                         sent again by the reconciler until the robot confirms,
+//!                                         also after a restart of the server
+//! state of the robot ─► measured standstill ─► stored by the reconciler
 //! clear ──► the database ─► the robot ─► cleared, or refused: a newer stop, or it still moves
 //! ```
 //!
-//! An open stop belongs to a robot: a robot has at most one, and a new one replaces the one before,
-//! which stays in the history. The stops that are sent again are thus limited by the number of
-//! robots.
+//! A robot has at most one open stop. A new stop replaces it; the replaced one stays in the
+//! history. The number of robots therefore limits the number of stops that are sent again.
 //!
-//! The robot decides which stop is in force, in the order in which stops reached it: clearing the
-//! last one ends those before. A robot that no longer shows a stop that it had confirmed, and that
-//! nobody cleared, gets it again, and may answer that it was cleared (`decision`). All active and
-//! queued missions of a stopped robot are held, and only a person resumes them.
+//! The robot decides which stop is in force: the one that reached it last. Clearing this stop ends
+//! all earlier ones. If a robot no longer shows a stop that it had confirmed and that nobody cleared,
+//! the server sends the stop again; the robot may answer that it was cleared (`decision`). All active
+//! and queued missions of a stopped robot are held, and only a person resumes them.
 
 mod decision;
 mod delivery;
@@ -158,10 +158,10 @@ impl App {
         })
     }
 
-    async fn stop_all(&self, keys: Vec<RobotKey>, said: StopReason) -> Vec<Stop> {
+    async fn stop_all(&self, keys: Vec<RobotKey>, reason: StopReason) -> Vec<Stop> {
         let requested_at = self.clock().now();
-        let by = text_or(said.by, SOMEBODY);
-        let reason = text_or(said.reason, "no reason was given");
+        let by = text_or(reason.by, SOMEBODY);
+        let reason = text_or(reason.reason, "no reason was given");
         let stop = |(site, robot): RobotKey| Stop {
             id: self.clock().new_id::<StopId>(),
             site,

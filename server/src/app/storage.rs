@@ -36,7 +36,7 @@ use crate::error_text::chain;
 const CHECK_EVERY: Duration = Duration::from_secs(5);
 /// Maximum age of a check that answers a request for readiness: anybody may send one, and each
 /// check costs a synced write.
-const CHECK_SHARED_FOR: Duration = Duration::from_secs(1);
+const CHECK_VALIDITY: Duration = Duration::from_secs(1);
 /// Maximum time for one part of a check before it counts as failed.
 const CHECK_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time without a failure after which the storage counts as working again.
@@ -199,7 +199,7 @@ impl App {
 
     /// Returns whether the server can work now; checks unless the last check is recent.
     pub async fn ready(&self) -> StorageCondition {
-        self.check_storage(CHECK_SHARED_FOR).await
+        self.check_storage(CHECK_VALIDITY).await
     }
 
     /// Checks unless the last check is younger than `shared_for`.
@@ -243,7 +243,7 @@ impl App {
         condition
     }
 
-    /// Examines the whole file, if there is a reason and the last examination is not too recent.
+    /// Examines the whole database if damage is suspected or known and the last examination is old enough.
     async fn examine_database(&self) {
         let reports = failure::count(StorageFailure::Damaged);
         let now = self.clock().elapsed();
@@ -444,7 +444,7 @@ fn is_low(free_bytes: Option<u64>, limit_bytes: u64, was_low: bool) -> bool {
 /// Checks periodically until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     while !stop.is_cancelled() {
-        app.check_storage(CHECK_SHARED_FOR).await;
+        app.check_storage(CHECK_VALIDITY).await;
         app.end_restart_notice();
         tokio::select! {
             () = stop.cancelled() => return,

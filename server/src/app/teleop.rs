@@ -53,7 +53,7 @@ const RELEASE_TRIES: u32 = 5;
 /// Wait between two attempts.
 const RELEASE_RETRY: Duration = Duration::from_millis(300);
 /// Validity of a command with zero velocity: as long as the robot would take to stop by itself.
-const STAND_FOR: Duration = Duration::from_millis(250);
+const STOP_COMMAND_VALIDITY: Duration = Duration::from_millis(250);
 /// Maximum time that a new driver waits until holding the missions is stored.
 const HOLD_WAIT_MAX: Duration = Duration::from_millis(300);
 /// Wait between two attempts to store it.
@@ -94,29 +94,29 @@ fn refused_by_robot(refusal: CommandRefusal) -> Refused {
 #[derive(Debug, Default)]
 pub(super) struct Holds {
     /// Whether holding was requested again since the last attempt began.
-    asked: Mutex<HashMap<RobotKey, bool>>,
+    requests: Mutex<HashMap<RobotKey, bool>>,
 }
 
 impl Holds {
     fn lock(&self) -> MutexGuard<'_, HashMap<RobotKey, bool>> {
-        self.asked.lock().unwrap_or_else(PoisonError::into_inner)
+        self.requests.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Requests holding; returns true if no task is working on it.
-    fn ask(&self, key: &RobotKey) -> bool {
+    fn request_hold(&self, key: &RobotKey) -> bool {
         self.lock().insert(key.clone(), true).is_none()
     }
 
     /// Returns whether holding was requested since the last attempt; if not, removes the robot.
-    fn is_asked(&self, key: &RobotKey) -> bool {
-        let mut asked = self.lock();
-        match asked.get_mut(key) {
+    fn take_request(&self, key: &RobotKey) -> bool {
+        let mut requests = self.lock();
+        match requests.get_mut(key) {
             Some(again) if *again => {
                 *again = false;
                 true
             }
             Some(_) | None => {
-                asked.remove(key);
+                requests.remove(key);
                 false
             }
         }
@@ -292,14 +292,14 @@ impl Session {
         let (written, is_written) = oneshot::channel();
         let ending = self.app.supervisor().stop_token();
         // The task that is working on it does it once more.
-        if !app.holds().ask(&key) {
+        if !app.holds().request_hold(&key) {
             return;
         }
         self.app.supervisor().spawn_passing("hold", async move {
-            while app.holds().is_asked(&key) {
+            while app.holds().take_request(&key) {
                 if let Err(error) = db::limited(app.hold_for_driver(&key, &name)).await {
                     app.log_failure("write down that missions are held for a driver", &error);
-                    app.holds().ask(&key);
+                    app.holds().request_hold(&key);
                     tokio::select! {
                         () = ending.cancelled() => return,
                         () = tokio::time::sleep(HOLD_RETRY) => {}
@@ -369,7 +369,7 @@ impl Session {
     /// Releases the lease, after a command with zero velocity. Returns whether the session had one.
     pub fn release(&mut self) -> bool {
         // If the robot's clock is not known, the robot stops when its last command ends.
-        let _ = self.send(Twist::default(), STAND_FOR);
+        let _ = self.send(Twist::default(), STOP_COMMAND_VALIDITY);
         match self.active.take() {
             Some(active) => {
                 self.return_lease(active.lease, active.granted);

@@ -1,14 +1,14 @@
 //! Requests states of watched robots at a higher rate.
 //!
 //! A robot is watched while a drive socket of it is open. Its agent gets a request for
-//! [`WATCHED_STATE_RATE_HZ`] that lasts [`ASK_FOR`], again every [`ASK_PERIOD`]; when no socket is
+//! [`WATCHED_STATE_RATE_HZ`] that lasts [`REQUEST_DURATION`], again every [`REQUEST_PERIOD`]; when no socket is
 //! left, the agent returns to its own rate by itself.
 //!
 //! ```text
-//! watched, online ──► asked ──done──► due after ASK_PERIOD
-//!                       ├──no answer──► due after ASK_PERIOD; after TRIES_MAX of a run that never
-//!                       │               answered, due after REST
-//!                       └──refused, not understood──► due after REST
+//! watched, online ──► asked ──done──► due after REQUEST_PERIOD
+//!                       ├──no answer──► due after REQUEST_PERIOD; after TRIES_MAX of a run that never
+//!                       │               answered, due after REQUEST_PAUSE
+//!                       └──refused, not understood──► due after REQUEST_PAUSE
 //! ```
 //!
 //! An agent of an older release does not answer the command. Another run of an agent is asked anew.
@@ -30,26 +30,26 @@ use super::presence::RobotKey;
 use super::robot_link::Undelivered;
 
 /// Duration of one request: two of them may be lost without an effect.
-pub const ASK_FOR: Duration = Duration::from_secs(5);
+pub const REQUEST_DURATION: Duration = Duration::from_secs(5);
 /// Interval of the requests to one robot.
-pub const ASK_PERIOD: Duration = Duration::from_millis(1_500);
-/// Number of requests without an answer after which a run that never answered is left alone.
+pub const REQUEST_PERIOD: Duration = Duration::from_millis(1_500);
+/// Number of unanswered requests after which a run that never answered gets none for [`REQUEST_PAUSE`].
 pub const TRIES_MAX: u32 = 3;
-/// Time for which a run is left alone that does not answer or refuses.
-pub const REST: Duration = Duration::from_mins(10);
+/// Time without requests to a run that refused, or that never answered.
+pub const REQUEST_PAUSE: Duration = Duration::from_mins(10);
 /// Maximum number of requests under way.
-pub const ASKED_AT_ONCE_MAX: usize = 32;
+pub const REQUESTS_AT_ONCE_MAX: usize = 32;
 /// Interval of checks for robots that are due.
-const LOOK_PERIOD: Duration = Duration::from_millis(250);
-/// Maximum number of robots that nobody watches any more and whose last answer is remembered.
+const CHECK_PERIOD: Duration = Duration::from_millis(250);
+/// Maximum number of unwatched robots whose last answer is kept.
 pub const REMEMBERED_MAX: usize = 4_096;
 
-/// What is known of a run of an agent that was asked.
+/// State of the requests to one run of an agent.
 #[derive(Debug, Clone, Copy)]
 struct Run {
     boot: BootId,
     due: Duration,
-    is_asked: bool,
+    is_pending: bool,
     /// Whether it has answered a request.
     has_answered: bool,
     /// Number of requests without an answer since the last answer.
@@ -63,7 +63,7 @@ struct Robot {
     run: Option<Run>,
 }
 
-/// What came of a request.
+/// Outcome of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Outcome {
     Done,
@@ -139,13 +139,13 @@ impl Watched {
                 robot.run = Some(Run {
                     boot,
                     due: now,
-                    is_asked: false,
+                    is_pending: false,
                     has_answered: false,
                     unanswered: 0,
                 });
             }
             if let Some(run) = robot.run.as_mut()
-                && !run.is_asked
+                && !run.is_pending
                 && run.due <= now
             {
                 due.push((run.due, key.clone(), run));
@@ -153,22 +153,22 @@ impl Watched {
         }
         due.sort_by_key(|(since, ..)| *since);
         let has_more = due.len() > room;
-        let asked = due.into_iter().take(room).map(|(_, key, run)| {
-            run.is_asked = true;
+        let requests = due.into_iter().take(room).map(|(_, key, run)| {
+            run.is_pending = true;
             (key, run.boot)
         });
-        (asked.collect(), has_more)
+        (requests.collect(), has_more)
     }
 
-    /// Records what came of a request.
-    fn asked(&self, (key, boot): &(RobotKey, BootId), outcome: Outcome, now: Duration) {
+    /// Records the outcome of a request, and schedules the next one.
+    fn record_outcome(&self, (key, boot): &(RobotKey, BootId), outcome: Outcome, now: Duration) {
         let mut robots = self.lock();
         let run = robots.get_mut(key).and_then(|robot| robot.run.as_mut());
         // An answer of an earlier run says nothing about the present one.
         let Some(run) = run.filter(|run| run.boot == *boot) else {
             return;
         };
-        run.is_asked = false;
+        run.is_pending = false;
         let rests = match outcome {
             Outcome::Done => {
                 run.has_answered = true;
@@ -184,27 +184,31 @@ impl Watched {
         if rests {
             run.unanswered = 0;
         }
-        run.due = now + if rests { REST } else { ASK_PERIOD };
+        run.due = now + if rests { REQUEST_PAUSE } else { REQUEST_PERIOD };
     }
 }
 
 impl Run {
-    /// Returns whether it would be asked now as if it had never been asked before.
-    fn is_as_new(&self, now: Duration) -> bool {
+    /// Returns whether dropping this state would change nothing: a new state would be due now too.
+    fn is_disposable(&self, now: Duration) -> bool {
         let forgotten_at = if self.unanswered > 0 {
-            self.due.saturating_add(REST)
+            self.due.saturating_add(REQUEST_PAUSE)
         } else {
             self.due
         };
-        !self.is_asked && forgotten_at <= now
+        !self.is_pending && forgotten_at <= now
     }
 }
 
-/// Forgets robots that nobody watches and of whose runs nothing needs to be remembered; of more than
-/// [`REMEMBERED_MAX`] others, those that are due first.
+/// Drops the state of unwatched robots whose run needs no state. Keeps at most [`REMEMBERED_MAX`]
+/// other unwatched robots, and drops those that are due first.
 fn evict_idle(robots: &mut HashMap<RobotKey, Robot>, now: Duration) {
     robots.retain(|_, robot| {
-        robot.watchers > 0 || robot.run.as_ref().is_some_and(|run| !run.is_as_new(now))
+        robot.watchers > 0
+            || robot
+                .run
+                .as_ref()
+                .is_some_and(|run| !run.is_disposable(now))
     });
     let unwatched = robots.values().filter(|robot| robot.watchers == 0).count();
     if unwatched <= REMEMBERED_MAX {
@@ -227,11 +231,11 @@ impl App {
         self.watched().count()
     }
 
-    async fn ask_state_rate(&self, asked: (RobotKey, BootId)) {
-        let (key, boot) = &asked;
+    async fn ask_state_rate(&self, run: (RobotKey, BootId)) {
+        let (key, boot) = &run;
         let command = StateRate {
             rate_hz: WATCHED_STATE_RATE_HZ,
-            for_ms: u64::try_from(ASK_FOR.as_millis()).unwrap_or(u64::MAX),
+            for_ms: u64::try_from(REQUEST_DURATION.as_millis()).unwrap_or(u64::MAX),
         };
         self.counters().state_rates_requested.one();
         let answer = self.commands().send_to(key, Some(*boot), &command).await;
@@ -246,23 +250,23 @@ impl App {
             Err(Undelivered::Unreachable | Undelivered::NoAnswer) => Outcome::NoAnswer,
         };
         self.watched()
-            .asked(&asked, outcome, self.clock().elapsed());
+            .record_outcome(&run, outcome, self.clock().elapsed());
     }
 }
 
-/// Asks the agents of watched robots until the stop.
+/// Requests the higher rate from the agents of watched robots until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     let watched = app.watched().clone();
-    let mut asking = FuturesUnordered::new();
-    let mut looks = tokio::time::interval(LOOK_PERIOD);
+    let mut requests = FuturesUnordered::new();
+    let mut looks = tokio::time::interval(CHECK_PERIOD);
     looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
         let has_more = {
-            let room = ASKED_AT_ONCE_MAX.saturating_sub(asking.len());
+            let room = REQUESTS_AT_ONCE_MAX.saturating_sub(requests.len());
             let now = app.clock().elapsed();
             let online = |key: &RobotKey| app.presences().online_run(key, now);
             let (due, has_more) = watched.due(online, now, room);
-            asking.extend(due.into_iter().map(|asked| app.ask_state_rate(asked)));
+            requests.extend(due.into_iter().map(|run| app.ask_state_rate(run)));
             has_more
         };
         loop {
@@ -271,7 +275,7 @@ pub async fn run(app: App, stop: CancellationToken) {
                 () = stop.cancelled() => return,
                 _ = looks.tick() => break,
                 () = watched.begun.notified() => break,
-                Some(()) = asking.next(), if !asking.is_empty() => {
+                Some(()) = requests.next(), if !requests.is_empty() => {
                     if has_more {
                         break;
                     }

@@ -1,7 +1,7 @@
-//! Webhooks: their settings, and the outbox of what they are to be sent.
+//! Webhooks: their settings, and the outbox of their deliveries.
 //!
-//! The transaction that raises or ends an alert also queues the deliveries of it, so neither is
-//! there without the other. [`delivery`] sends what is queued. Nothing here waits for a receiver.
+//! The transaction that raises or ends an alert also queues its deliveries, so both are committed or
+//! neither is. [`delivery`] sends the queued deliveries; this module waits for no receiver.
 
 pub mod delivery;
 

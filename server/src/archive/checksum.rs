@@ -40,7 +40,7 @@ impl ChecksumWriter {
         }
     }
 
-    /// Returns the number of bytes so far, and the checksum of those since the last call.
+    /// Returns the total number of bytes written, and the checksum of the bytes since the last call.
     pub(super) fn take(&mut self) -> (u64, u32) {
         let sum = self.crc.sum();
         self.crc.reset();

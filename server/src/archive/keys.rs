@@ -78,7 +78,7 @@ impl Listing {
         self.files.iter().chain(&self.lost).copied()
     }
 
-    /// Returns the last key before those of a file; `None` if there is none.
+    /// Returns the last archived key that precedes `keys`; `None` if there is none.
     pub(super) fn preceding(&self, keys: KeyRange) -> Option<i64> {
         let all = self.all().map(|found| found.last);
         all.filter(|last| *last < keys.first).max()

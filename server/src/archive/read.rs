@@ -1,4 +1,4 @@
-//! Reads a file: only the row groups that may contain what is wanted, and only after their checksums.
+//! Reads the row groups of a file that may contain selected rows, after it has verified their checksums.
 
 use std::ops::Range;
 use std::path::PathBuf;
@@ -54,16 +54,16 @@ impl OpenFile {
             let footer = checksum::read_footer(&source)?;
             let metadata = ParquetMetaDataReader::decode_metadata(&footer.bytes)?;
             let about = metadata.file_metadata();
-            let said = about.key_value_metadata().map_or(&[][..], Vec::as_slice);
-            if value_of(said, schema::FORMAT_KEY) != Some(schema::FORMAT) {
+            let key_values = about.key_value_metadata().map_or(&[][..], Vec::as_slice);
+            if value_of(key_values, schema::FORMAT_KEY) != Some(schema::FORMAT) {
                 return Err(fault("it is not of this format"));
             }
             if about.schema() != &schema::columns()? {
                 return Err(fault("it has other columns"));
             }
-            let follows = value_of(said, schema::FOLLOWS_KEY);
+            let follows = value_of(key_values, schema::FOLLOWS_KEY);
             let follows = follows.and_then(|follows| follows.parse().ok());
-            let groups = value_of(said, schema::ROW_GROUPS_KEY).unwrap_or_default();
+            let groups = value_of(key_values, schema::ROW_GROUPS_KEY).unwrap_or_default();
             let counts = metadata.row_groups().iter();
             let counts: Vec<i64> = counts.map(RowGroupMetaData::num_rows).collect();
             let groups = groups_of(groups, &counts, keys, footer.begin);
@@ -77,8 +77,8 @@ impl OpenFile {
         })
     }
 
-    /// Checks that this file follows the last key before it, if there is one. Returns a key that is
-    /// missing between them.
+    /// Checks that no key of this file precedes `preceding`, the last key of the preceding file. Returns
+    /// the last key that is missing between both files; `None` if there is no gap.
     pub(super) fn missing_before(
         &self,
         preceding: Option<i64>,
@@ -128,11 +128,11 @@ impl OpenFile {
                 }
                 let keys = KeyRange { first, last };
                 budget.rows = budget.rows.saturating_sub(place(keys.count()));
-                let wanted = limit - found.segments.len();
+                let needed = limit - found.segments.len();
                 let part = Part { group: index, keys };
-                let read = || self.read_part(part, selection, wanted);
+                let read = || self.read_part(part, selection, needed);
                 let segments = guarded(&self.path, read)?;
-                let is_full = segments.len() >= wanted;
+                let is_full = segments.len() >= needed;
                 found.segments.extend(segments);
                 if let (true, Some(segment)) = (is_full, found.segments.last()) {
                     found.searched_to = segment.stored.id;
@@ -202,8 +202,8 @@ impl OpenFile {
     }
 }
 
-fn value_of<'said>(said: &'said [KeyValue], key: &str) -> Option<&'said str> {
-    let found = said.iter().find(|pair| pair.key == key);
+fn value_of<'metadata>(metadata: &'metadata [KeyValue], key: &str) -> Option<&'metadata str> {
+    let found = metadata.iter().find(|pair| pair.key == key);
     found.and_then(|pair| pair.value.as_deref())
 }
 
@@ -214,11 +214,11 @@ fn place(count: i64) -> usize {
 
 /// Returns the row groups of a file from their ends and checksums, and their numbers of rows; `None` if
 /// they do not have the keys of the file.
-fn groups_of(said: &str, counts: &[i64], keys: KeyRange, footer_at: u64) -> Option<Vec<Group>> {
+fn groups_of(text: &str, counts: &[i64], keys: KeyRange, footer_at: u64) -> Option<Vec<Group>> {
     let mut groups = Vec::new();
     let (mut first, mut begin) = (keys.first, 0);
     let mut counts = counts.iter();
-    for group in said.split(',') {
+    for group in text.split(',') {
         let (end, sum) = group.split_once(' ')?;
         let (end, sum) = (end.parse().ok()?, u32::from_str_radix(sum, 16).ok()?);
         let next = first.checked_add(*counts.next().filter(|count| **count > 0)?)?;

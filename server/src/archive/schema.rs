@@ -80,7 +80,7 @@ pub(super) fn columns() -> Result<Type, ParquetError> {
 
 /// Returns how files are written that follow a key.
 pub(super) fn properties(follows: i64, checksum: String) -> Result<WriterProperties, ParquetError> {
-    let said = vec![
+    let metadata = vec![
         KeyValue::new(FORMAT_KEY.to_owned(), FORMAT.to_owned()),
         KeyValue::new(FOLLOWS_KEY.to_owned(), follows.to_string()),
         KeyValue::new(CHECKSUM_KEY.to_owned(), checksum),
@@ -93,7 +93,7 @@ pub(super) fn properties(follows: i64, checksum: String) -> Result<WriterPropert
         .set_data_page_row_count_limit(PAGE_ROWS)
         .set_write_batch_size(PAGE_ROWS)
         .set_max_row_group_row_count(Some(ROW_GROUP_ROWS))
-        .set_key_value_metadata(Some(said));
+        .set_key_value_metadata(Some(metadata));
     for name in RISING {
         let path = ColumnPath::from(name);
         builder = builder.set_column_encoding(path, Encoding::DELTA_BINARY_PACKED);

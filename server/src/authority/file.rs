@@ -512,8 +512,8 @@ impl Folder {
     }
 
     fn remove_all(&self, names: &[&'static str]) -> Result<(), AuthorityError> {
-        let mut there = names.iter().filter(|name| self.has(name));
-        there.try_for_each(|name| self.apply(&Step::Remove(name)))
+        let mut existing = names.iter().filter(|name| self.has(name));
+        existing.try_for_each(|name| self.apply(&Step::Remove(name)))
     }
 
     /// Reads the authorities; call [`Self::recover`] first.

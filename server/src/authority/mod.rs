@@ -38,10 +38,10 @@ pub use self::rotation::{Authorities, Retiring, RotationError, RotationRefused, 
 pub use tread_store::Issued;
 
 /// Validity period of the authority's certificate.
-const AUTHORITY_LASTS: SignedDuration = SignedDuration::from_hours(20 * 365 * 24);
+const AUTHORITY_VALIDITY: SignedDuration = SignedDuration::from_hours(20 * 365 * 24);
 /// Validity period of the certificate of the robots' port. It is replaced at each start, and before
 /// a third of this period is over.
-pub const PORT_LASTS: SignedDuration = SignedDuration::from_hours(90 * 24);
+pub const PORT_CERTIFICATE_VALIDITY: SignedDuration = SignedDuration::from_hours(90 * 24);
 /// Time by which a robot's clock may be behind the server's when it checks the port's certificate.
 const BEHIND_MAX: SignedDuration = SignedDuration::from_hours(24);
 /// Time after its expiry during which a certificate is still accepted for a renewal, so that a
@@ -163,7 +163,7 @@ impl Authority {
         let mut params = CertificateParams::default();
         params.distinguished_name = named(name);
         params.not_before = SystemTime::from(earlier(now, BEHIND_MAX)).into();
-        params.not_after = SystemTime::from(later(now, AUTHORITY_LASTS)).into();
+        params.not_after = SystemTime::from(later(now, AUTHORITY_VALIDITY)).into();
         params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
         params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
         let signed = params.self_signed(&key)?;
@@ -268,7 +268,7 @@ impl Authority {
         let mut params = CertificateParams::new(all)?;
         params.distinguished_name = named("tread-server");
         params.not_before = SystemTime::from(earlier(now, BEHIND_MAX)).into();
-        params.not_after = SystemTime::from(later(now, PORT_LASTS)).into();
+        params.not_after = SystemTime::from(later(now, PORT_CERTIFICATE_VALIDITY)).into();
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
         params.use_authority_key_identifier_extension = true;

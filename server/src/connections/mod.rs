@@ -225,10 +225,10 @@ impl Slot {
         RequestGuard(Arc::clone(self))
     }
 
-    /// Returns the delay of a request whose head has arrived at `now`. An identity that the last
-    /// request on this connection showed has one rate limit over all its connections; other
-    /// requests have one per connection. Other requests do not delay a Stop of an authenticated
-    /// connection.
+    /// Returns the delay of a request whose head has arrived at `now`. If the last request on this
+    /// connection was authenticated, the rate limit is that of its identity over all its connections;
+    /// otherwise, and for every Stop, it is that of the connection. Other requests of an
+    /// identity therefore do not delay its Stop.
     pub fn delay(&self, purpose: Purpose, now: Instant) -> Duration {
         let now = now.saturating_duration_since(self.connections.begun);
         self.connections.lock().delay(self.id, purpose, now)

@@ -53,15 +53,15 @@ fn is_synchronised() -> Option<bool> {
         return Some(true);
     }
     let words = ["show", "--property=NTPSynchronized", "--value"];
-    let said = output_of("timedatectl", &words);
-    match said.as_deref().map(str::trim) {
+    let output = output_of("timedatectl", &words);
+    match output.as_deref().map(str::trim) {
         Some("yes") => return Some(true),
         Some("no") => return Some(false),
         Some(_) | None => {}
     }
     // The last field of the table is the leap status.
-    let said = output_of("chronyc", &["-c", "tracking"])?;
-    let leap = said.trim().rsplit(',').next()?.to_owned();
+    let output = output_of("chronyc", &["-c", "tracking"])?;
+    let leap = output.trim().rsplit(',').next()?.to_owned();
     Some(leap != "Not synchronised")
 }
 

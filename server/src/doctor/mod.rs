@@ -92,7 +92,7 @@ async fn examine(args: DoctorArgs) -> Vec<Finding> {
             )];
         }
     };
-    let said = match &args.config {
+    let source = match &args.config {
         Some(file) => format!("`{}` can be used", file.display()),
         None => "the built-in values are used, since no --config is given".to_owned(),
     };
@@ -103,7 +103,7 @@ async fn examine(args: DoctorArgs) -> Vec<Finding> {
         clock: Clock::system(),
         is_deep: args.deep,
     };
-    let mut findings = vec![Finding::on("configuration").ok(said)];
+    let mut findings = vec![Finding::on("configuration").ok(source)];
     findings.push(match examined.server_process {
         Some(process) => Finding::on("server").ok(format!("it runs, as process {process}")),
         None => Finding::on("server").skipped("it does not run on this database"),

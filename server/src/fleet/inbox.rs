@@ -228,8 +228,8 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
         .complete(true)
         .callback(move |query| {
             if let Some(place) = to.admit(query.key_expr().as_str(), Kind::Hello) {
-                let asked = LimitedQuery { query, place };
-                deliver(&to.hellos, asked, &to.app.counters().hellos_dropped);
+                let limited = LimitedQuery { query, place };
+                deliver(&to.hellos, limited, &to.app.counters().hellos_dropped);
             }
         })
         .background()
@@ -240,8 +240,8 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
         .complete(true)
         .callback(move |query| {
             if let Some(place) = to.admit(query.key_expr().as_str(), Kind::Upload) {
-                let asked = LimitedQuery { query, place };
-                deliver(&to.uploads, asked, &to.app.counters().ingest_dropped_busy);
+                let limited = LimitedQuery { query, place };
+                deliver(&to.uploads, limited, &to.app.counters().ingest_dropped_busy);
             }
         })
         .background()
@@ -317,7 +317,7 @@ async fn watch_presence(
                 appeared: true,
             } => appeared(&app, &mut tokens, &key, router),
             TokenChange::Token { key, router, .. } => {
-                if tokens.gone(&key, router) {
+                if tokens.remove(&key, router) {
                     gone(&app, &key);
                 }
             }
@@ -336,7 +336,7 @@ fn appeared(app: &App, tokens: &mut tokens::Tokens, token: &str, router: u64) {
         return refuse_key(app, token);
     };
     let key = (site, robot);
-    if !app.admits(&key) || !tokens.appeared(token, router) {
+    if !app.admits(&key) || !tokens.add(token, router) {
         return;
     }
     let (site, robot) = &key;

@@ -149,9 +149,9 @@ impl Robot {
 
     /// Counts a token on a router; returns whether there are too many.
     fn declared(&mut self, router: u64, now: Duration) -> bool {
-        let there = self.declared.entry(router).or_default();
-        *there += 1;
-        *there > DECLARED_TOKENS_MAX || !self.appearing.take(DECLARED_TOKENS_RATE, now)
+        let count = self.declared.entry(router).or_default();
+        *count += 1;
+        *count > DECLARED_TOKENS_MAX || !self.appearing.take(DECLARED_TOKENS_RATE, now)
     }
 
     /// Processes a token if there is room and it does not come too fast; returns whether it did.
@@ -273,9 +273,9 @@ impl RateLimits {
             return false;
         };
         known.late.retain(|late| late != place);
-        if let Some(there) = known.declared.get_mut(&place.1) {
-            *there -= 1;
-            if *there == 0 {
+        if let Some(count) = known.declared.get_mut(&place.1) {
+            *count -= 1;
+            if *count == 0 {
                 known.declared.remove(&place.1);
             }
         }

@@ -1,8 +1,8 @@
-//! Publishes once more, on a zenoh router of this machine, what robots publish and where maps change.
+//! Republishes the robots' states and friction, and changes of maps, on another zenoh router of this machine.
 //!
-//! The server's own routers are for robots alone. A site's subscribers, such as a dashboard or a bridge, find
-//! states and friction at that router under the same keys, and nothing that they do there reaches a robot: the
-//! server reads nothing from it.
+//! Only robots may connect to the server's own routers. Subscribers of a site, such as a dashboard or a bridge,
+//! connect to the other router and receive the messages under the same keys. The server reads nothing from that
+//! router, so nothing that is published there reaches a robot.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -153,7 +153,7 @@ async fn run(
     close(session).await;
 }
 
-/// Opens a session, which connects again by itself when the router was away. Blocks its thread.
+/// Opens a session, which reconnects automatically after the router was unavailable. Blocks its thread.
 fn open(router: SocketAddr) -> zenoh::Result<Session> {
     zenoh::open(client_config(router, None, OPEN_TIMEOUT.as_millis())?).wait()
 }

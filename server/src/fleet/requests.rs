@@ -149,12 +149,12 @@ pub(super) async fn serve_hellos(
     mut queries: mpsc::Receiver<LimitedQuery>,
     stop: CancellationToken,
 ) {
-    while let Some(asked) = next(&mut queries, &stop).await {
-        let Some((site, hello)) = replies.read(&asked.query, |hello: &Hello| &hello.robot) else {
+    while let Some(limited) = next(&mut queries, &stop).await {
+        let Some((site, hello)) = replies.read(&limited.query, |hello: &Hello| &hello.robot) else {
             continue;
         };
         let app = replies.app.clone();
-        replies.answer(asked, async move {
+        replies.answer(limited, async move {
             let welcome = app.hello(&site, &hello?).await?;
             app.counters().hellos_answered.one();
             Ok(welcome)
@@ -169,8 +169,8 @@ pub(super) async fn serve_uploads(
     writer: mpsc::Sender<Upload>,
     stop: CancellationToken,
 ) {
-    while let Some(asked) = next(&mut queries, &stop).await {
-        let Some((site, batch)) = replies.read(&asked.query, |batch: &Batch| &batch.robot) else {
+    while let Some(limited) = next(&mut queries, &stop).await {
+        let Some((site, batch)) = replies.read(&limited.query, |batch: &Batch| &batch.robot) else {
             continue;
         };
         let outcome = batch.and_then(|batch| {
@@ -185,7 +185,7 @@ pub(super) async fn serve_uploads(
                 busy("too many uploads are waiting")
             })
         });
-        replies.answer(asked, async move {
+        replies.answer(limited, async move {
             let answered = outcome?;
             answered
                 .await

@@ -95,9 +95,9 @@ async fn answers(watch: &Watch, router: &Arc<Router>) -> bool {
     matches!(looked, Ok(Some(true)))
 }
 
-/// Opens a router in place of one that does not answer. One that still has robots stays open:
-/// behind the gate beside the new one, until they have left it; without a gate, where there is only
-/// one address, as long as it has robots.
+/// Replaces a router that does not answer. A router that still has robots stays open. With a gate, the
+/// new router is opened at once and the old one closes when its robots have left; without a gate,
+/// there is only one address, so the new router is opened when the old one has no robots.
 async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
     let _turn = pool.turn.lock().await;
     let current = pool.current();
@@ -135,7 +135,7 @@ async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
 
 /// Queries the router over a connection of its own; returns whether it answered. Blocks its thread.
 fn probe(router: &Router, credentials: Option<&RouterCredentials>) -> bool {
-    let asked = || -> zenoh::Result<bool> {
+    let query = || -> zenoh::Result<bool> {
         let config = client_config(router.address, credentials, PROBE_TIMEOUT.as_millis())?;
         let session = zenoh::open(config).wait()?;
         let replies = session.get(PROBE_KEY).timeout(PROBE_TIMEOUT).wait()?;
@@ -143,7 +143,7 @@ fn probe(router: &Router, credentials: Option<&RouterCredentials>) -> bool {
         session.close().wait()?;
         Ok(answered)
     };
-    asked().unwrap_or(false)
+    query().unwrap_or(false)
 }
 
 #[cfg(test)]

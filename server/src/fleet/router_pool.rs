@@ -31,7 +31,7 @@ const SUPERSEDED_MAX: usize = 8;
 /// Minimum interval between two openings: robots that join at about the same time share a router.
 const OPEN_EVERY: Duration = Duration::from_millis(500);
 /// Interval of checks for unused routers.
-const LOOK_EVERY: Duration = Duration::from_secs(5);
+const CHECK_EVERY: Duration = Duration::from_secs(5);
 
 /// State for opening, replacing and closing routers.
 #[derive(Debug)]
@@ -129,7 +129,7 @@ impl RouterPool {
                 () = stop.cancelled() => return,
                 _ = joined.changed() => {}
                 () = changed(&mut rotated) => {}
-                () = tokio::time::sleep(LOOK_EVERY) => {}
+                () = tokio::time::sleep(CHECK_EVERY) => {}
             }
         }
     }

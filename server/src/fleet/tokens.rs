@@ -12,37 +12,38 @@ pub(super) const CLOSED_MAX: usize = 64;
 /// The present tokens.
 #[derive(Debug, Default)]
 pub(super) struct Tokens {
-    there: HashMap<String, HashSet<u64>>,
+    routers_of: HashMap<String, HashSet<u64>>,
     closed: VecDeque<u64>,
 }
 
 impl Tokens {
     /// Adds a token on a router. Returns whether it was on none before.
-    pub(super) fn appeared(&mut self, token: &str, router: u64) -> bool {
+    pub(super) fn add(&mut self, token: &str, router: u64) -> bool {
         if self.closed.contains(&router) {
             // It was under way when the router closed, and would never be removed.
             return false;
         }
-        if let Some(routers) = self.there.get_mut(token) {
+        if let Some(routers) = self.routers_of.get_mut(token) {
             routers.insert(router);
             return false;
         }
-        if self.there.len() >= TOKENS_MAX {
+        if self.routers_of.len() >= TOKENS_MAX {
             return false;
         }
-        self.there.insert(token.to_owned(), HashSet::from([router]));
+        self.routers_of
+            .insert(token.to_owned(), HashSet::from([router]));
         true
     }
 
     /// Removes a token from a router. Returns whether it is on none now.
-    pub(super) fn gone(&mut self, token: &str, router: u64) -> bool {
-        let Some(routers) = self.there.get_mut(token) else {
+    pub(super) fn remove(&mut self, token: &str, router: u64) -> bool {
+        let Some(routers) = self.routers_of.get_mut(token) else {
             return false;
         };
         routers.remove(&router);
         let is_nowhere = routers.is_empty();
         if is_nowhere {
-            self.there.remove(token);
+            self.routers_of.remove(token);
         }
         is_nowhere
     }
@@ -54,12 +55,12 @@ impl Tokens {
         }
         self.closed.push_back(router);
         let held = self
-            .there
+            .routers_of
             .iter()
             .filter(|(_, routers)| routers.contains(&router));
         let held: Vec<String> = held.map(|(token, _)| token.clone()).collect();
         held.into_iter()
-            .filter(|token| self.gone(token, router))
+            .filter(|token| self.remove(token, router))
             .collect()
     }
 }
@@ -91,13 +92,13 @@ mod tests {
                             model.insert((token.clone(), router));
                         }
                         let is_new = is_there(&model, &token) && !was_there;
-                        prop_assert_eq!(tokens.appeared(&token, router), is_new);
+                        prop_assert_eq!(tokens.add(&token, router), is_new);
                     }
                     1 => {
                         let was_there = is_there(&model, &token);
                         model.remove(&(token.clone(), router));
                         let went = was_there && !is_there(&model, &token);
-                        prop_assert_eq!(tokens.gone(&token, router), went);
+                        prop_assert_eq!(tokens.remove(&token, router), went);
                     }
                     _ => {
                         let before: HashSet<String> = model.iter().map(|(of, _)| of.clone()).collect();

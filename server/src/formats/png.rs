@@ -272,7 +272,7 @@ fn write(canvas: &Canvas, raster: &Raster) -> Result<Vec<u8>, PngError> {
     encoder.set_color(::png::ColorType::Rgba);
     encoder.set_depth(::png::BitDepth::Eight);
     encoder.set_compression(::png::Compression::Fast);
-    for (keyword, text) in said(raster) {
+    for (keyword, text) in texts(raster) {
         encoder.add_itxt_chunk(keyword.to_owned(), text)?;
     }
     let mut writer = encoder.write_header()?;
@@ -282,9 +282,9 @@ fn write(canvas: &Canvas, raster: &Raster) -> Result<Vec<u8>, PngError> {
 }
 
 /// Returns the text chunks of the file: site, model, geometry and configuration of the map.
-fn said(raster: &Raster) -> BTreeMap<&'static str, String> {
+fn texts(raster: &Raster) -> BTreeMap<&'static str, String> {
     let corner = raster.corner();
-    let mut said = BTreeMap::from([
+    let mut texts = BTreeMap::from([
         ("tread:site", raster.site.id.to_string()),
         ("tread:model", raster.model.clone()),
         ("tread:first", format!("{} {}", corner.x_m, corner.y_m)),
@@ -293,10 +293,10 @@ fn said(raster: &Raster) -> BTreeMap<&'static str, String> {
         ("tread:rows", raster.rows.to_string()),
     ]);
     if let Some(configuration) = raster.configuration {
-        said.insert("tread:configuration", configuration.to_string());
+        texts.insert("tread:configuration", configuration.to_string());
     }
     if let Some(normalisation) = &raster.normalisation {
-        said.insert("tread:normalisation", normalisation.clone());
+        texts.insert("tread:normalisation", normalisation.clone());
     }
-    said
+    texts
 }

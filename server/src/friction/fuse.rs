@@ -145,28 +145,28 @@ fn fuse_in<R: Ord + Copy>(
     });
     let drift = config.drift_variance_per_s;
     let words = &mut room.room;
-    let said = |one: &EpochMeasurement<R>| {
+    let value = |one: &EpochMeasurement<R>| {
         Some(EpochValue {
             known: one.theta,
             bias_ratio: one.bias_ratio(config),
             tyre_ratio: one.tyre_ratio,
         })
     };
-    let (theta, heterogeneity) = joined(seen, words, said, (now_us, drift))?;
+    let (theta, heterogeneity) = joined(seen, words, value, (now_us, drift))?;
     let std_dev = theta.std_dev * heterogeneity.widening();
     if std_dev > THETA_STD_DEV_MAX {
         return None;
     }
     let mut layer = |value_of: fn(&EpochMeasurement<R>) -> Option<Known>| {
         let is_known = seen.iter().any(|one| value_of(one).is_some());
-        let said = |one: &EpochMeasurement<R>| {
+        let value = |one: &EpochMeasurement<R>| {
             value_of(one).map(|known| EpochValue {
                 known,
                 bias_ratio: config.robot_bias_ratio,
                 tyre_ratio: 0.0,
             })
         };
-        let joined = is_known.then(|| joined(seen, words, said, (now_us, 0.0)));
+        let joined = is_known.then(|| joined(seen, words, value, (now_us, 0.0)));
         joined.flatten().map(|joined| joined.0)
     };
     let (track, rolling) = (layer(|one| one.track), layer(|one| one.rolling));
@@ -271,9 +271,9 @@ impl Present {
         });
         let (kept, earlier_us) = keep_present(older, config);
         older.truncate(kept);
-        let was = older.first().map(|one| one.theta.value);
-        let is_bad_news = was.zip(now).is_none_or(|(was, now)| now > was);
-        if is_bad_news {
+        let earlier = older.first().map(|one| one.theta.value);
+        let is_slipperier = earlier.zip(now).is_none_or(|(earlier, now)| now > earlier);
+        if is_slipperier {
             return Self {
                 is_unconfirmed: true,
                 changed_at_us: Some(changed_at_us),

@@ -110,7 +110,7 @@ fn as_f64(count: u64) -> f64 {
 }
 
 /// Computes one estimate from the epochs in `seen`, which must be sorted by robot; `None` without
-/// any value. `said_of` extracts the value of an epoch; `drift` is the growth of a measurement's
+/// any value. `value_of` extracts the value of an epoch; `drift` is the growth of a measurement's
 /// variance with its age, per second.
 pub(super) fn joined<R: Ord + Copy>(
     seen: &[EpochMeasurement<R>],
@@ -119,7 +119,7 @@ pub(super) fn joined<R: Ord + Copy>(
         groups,
         ratios,
     }: &mut JoinBuffers,
-    said_of: impl Fn(&EpochMeasurement<R>) -> Option<EpochValue>,
+    value_of: impl Fn(&EpochMeasurement<R>) -> Option<EpochValue>,
     (now_us, drift): (i64, f64),
 ) -> Option<(Estimate, Heterogeneity)> {
     robots.clear();
@@ -129,14 +129,14 @@ pub(super) fn joined<R: Ord + Copy>(
         // The bias of a robot is the same in all epochs, so its standard deviations add linearly.
         let (mut bias, mut tyre) = (0.0, 0.0);
         for one in epochs {
-            let Some(said) = said_of(one) else { continue };
-            let known = said.known;
+            let Some(value) = value_of(one) else { continue };
+            let known = value.known;
             let weight = (known.information.recip() + drift * age_s(one, now_us)).recip();
             information += weight;
             weighted += weight * known.value;
             square += weight * known.value * known.value;
-            bias += weight * said.bias_ratio;
-            tyre += weight * said.tyre_ratio;
+            bias += weight * value.bias_ratio;
+            tyre += weight * value.tyre_ratio;
             heterogeneity.within_freedom += 1;
             heterogeneity.scatter += one.scatter;
             heterogeneity.scatter_freedom += one.passes.saturating_sub(1);

@@ -139,7 +139,7 @@ impl Connection {
         views.set_missed_tick_behavior(MissedTickBehavior::Skip);
         let ended = self.subject.ended();
         loop {
-            let went = tokio::select! {
+            let processed = tokio::select! {
                 biased;
                 () = stop.cancelled() => Err(End::Closed {
                     code: close_code::AWAY,
@@ -149,7 +149,7 @@ impl Connection {
                 frame = self.socket.recv() => self.receive(frame).await,
                 _ = views.tick() => self.show().await,
             };
-            if let Err(end) = went {
+            if let Err(end) = processed {
                 return end;
             }
         }
@@ -288,10 +288,10 @@ impl Connection {
         let Err(Refused { cause, detail }) = self.session.drive(drive) else {
             return Ok(());
         };
-        let is_said = self
+        let is_repeated = self
             .refused_at
-            .is_some_and(|(said, at)| said == cause && at.elapsed() < REFUSAL_PERIOD);
-        if is_said {
+            .is_some_and(|(last, at)| last == cause && at.elapsed() < REFUSAL_PERIOD);
+        if is_repeated {
             return Ok(());
         }
         self.refused_at = Some((cause, Instant::now()));

@@ -66,13 +66,13 @@ fn tagged(headers: &HeaderMap, tag: String, make: impl FnOnce() -> Response) -> 
 }
 
 fn with_tag(mut response: Response, tag: String) -> Response {
-    let said = response.headers_mut();
+    let headers = response.headers_mut();
     if let Ok(tag) = HeaderValue::try_from(tag) {
-        said.insert(header::ETAG, tag);
+        headers.insert(header::ETAG, tag);
     }
     // Cached, but revalidated each time: the map changes while robots drive.
     let held = HeaderValue::from_static("private, no-cache");
-    said.insert(header::CACHE_CONTROL, held);
+    headers.insert(header::CACHE_CONTROL, held);
     response
 }
 

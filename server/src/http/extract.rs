@@ -1,7 +1,7 @@
 //! Extractors of bodies, paths and queries, whose rejections are problems.
 //!
-//! `Json` refuses unknown fields: a client that misspells one wants to know. (Payloads of robots
-//! ignore them, so that old and new versions work together; the types are the same.)
+//! `Json` refuses unknown fields, so that a client learns of a misspelt one. (The decoder of robots'
+//! payloads uses the same types but ignores unknown fields, so that versions can differ.)
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -27,7 +27,7 @@ const UNKNOWN_FIELDS_NAMED_MAX: usize = 5;
 /// Maximum time for the body of a request with a credential to arrive.
 pub const BODY_TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum time for the body of a request without a credential to arrive.
-pub const STRANGER_BODY_TIMEOUT: Duration = Duration::from_secs(2);
+pub const UNAUTHENTICATED_BODY_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Maximum number of bytes beyond the limit of a body that are read and discarded, so that a client
 /// that is still sending gets the response instead of a broken connection.
@@ -59,7 +59,7 @@ impl<S: Send + Sync, T: DeserializeOwned + Serialize> FromRequest<S> for Json<T>
         let subject = request.extensions().get::<Subject>().cloned();
         let within = match &subject {
             Some(_) => BODY_TIMEOUT,
-            None => STRANGER_BODY_TIMEOUT,
+            None => UNAUTHENTICATED_BODY_TIMEOUT,
         };
         let reading = read(request.into_body(), limit);
         let body = tokio::time::timeout(within, reading).await;

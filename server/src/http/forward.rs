@@ -206,10 +206,10 @@ impl Forwarder {
         let Some(leader) = app.leader_url() else {
             return;
         };
-        let asking = self.client(Sharing::Known).get(format!("{leader}/healthz"));
+        let request = self.client(Sharing::Known).get(format!("{leader}/healthz"));
         // A standby says then that it is none.
-        let asking = asking.header(header::VIA, VIA).timeout(CONNECT_MAX).send();
-        match asking.await.and_then(reqwest::Response::error_for_status) {
+        let request = request.header(header::VIA, VIA).timeout(CONNECT_MAX).send();
+        match request.await.and_then(reqwest::Response::error_for_status) {
             Ok(_answer) => self.reached(),
             Err(cause) => self.failed(&leader, &cause),
         }
@@ -278,15 +278,15 @@ impl Forwarder {
         headers.append(header::VIA, HeaderValue::from_static(VIA));
         name_client(&mut headers, peer);
         let client = self.client(sharing);
-        let mut asking = client.request(parts.method, url).headers(headers);
+        let mut request = client.request(parts.method, url).headers(headers);
         if !body.is_end_stream() {
-            asking = asking.body(reqwest::Body::wrap_stream(body.into_data_stream()));
+            request = request.body(reqwest::Body::wrap_stream(body.into_data_stream()));
         }
         let answer = tokio::select! {
             biased;
             // The client asks again, and this server answers then.
             () = self.inner.given_up.cancelled() => return Err(unanswered),
-            answer = tokio::time::timeout(ANSWER_MAX, asking.send()) => answer,
+            answer = tokio::time::timeout(ANSWER_MAX, request.send()) => answer,
         };
         let answer = match answer {
             Ok(Ok(answer)) => answer,
@@ -329,11 +329,11 @@ pub(super) fn is_forwarded(headers: &HeaderMap) -> bool {
 
 /// Returns the same path at another server. A path that a URL would write in another way is refused, since a
 /// filter before this server has seen it as it came.
-fn url_at(leader: &str, asked: &Uri) -> Result<Url, ForwardError> {
-    let path = asked.path_and_query().map_or("/", PathAndQuery::as_str);
+fn url_at(leader: &str, requested: &Uri) -> Result<Url, ForwardError> {
+    let path = requested.path_and_query().map_or("/", PathAndQuery::as_str);
     let url = Url::parse(&format!("{leader}{path}"));
     let url = url.map_err(|_malformed| ForwardError::Path)?;
-    if url.path() == asked.path() {
+    if url.path() == requested.path() {
         Ok(url)
     } else {
         Err(ForwardError::Path)
@@ -386,7 +386,7 @@ fn join(
     *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
     *response.headers_mut() = answer.headers().clone();
     let stop = app.supervisor().stop_token();
-    app.pass_by("forwarded connection", async move {
+    app.spawn_background("forwarded connection", async move {
         let (Ok(ours), Ok(theirs)) = tokio::join!(upgrade, answer.upgrade()) else {
             debug!("a connection that was to be forwarded is closed");
             return;
@@ -408,18 +408,18 @@ async fn copy_both(
 ) {
     let (mut from_client, mut to_client) = tokio::io::split(ours);
     let (mut from_server, mut to_server) = tokio::io::split(theirs);
-    let asked = async {
+    let upstream = async {
         _ = tokio::io::copy(&mut from_client, &mut to_server).await;
         _ = to_server.shutdown().await;
     };
-    let answered = async {
+    let downstream = async {
         _ = tokio::io::copy(&mut from_server, &mut to_client).await;
         _ = to_client.shutdown().await;
     };
-    let (mut asked, mut answered) = (pin!(asked), pin!(answered));
+    let (mut upstream, mut downstream) = (pin!(upstream), pin!(downstream));
     let rest = tokio::select! {
-        () = asked.as_mut() => tokio::time::timeout(CLOSE_MAX, answered).await,
-        () = answered.as_mut() => tokio::time::timeout(CLOSE_MAX, asked).await,
+        () = upstream.as_mut() => tokio::time::timeout(CLOSE_MAX, downstream).await,
+        () = downstream.as_mut() => tokio::time::timeout(CLOSE_MAX, upstream).await,
     };
     if rest.is_err() {
         debug!("one side of a forwarded connection does not close it");

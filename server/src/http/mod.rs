@@ -297,11 +297,11 @@ struct Panicked;
 
 #[expect(clippy::needless_pass_by_value, reason = "the layer's signature")]
 fn broken(panic: Box<dyn Any + Send + 'static>) -> Response {
-    let said = panic.downcast_ref::<&str>().copied();
-    let said = said.or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+    let message = panic.downcast_ref::<&str>().copied();
+    let message = message.or_else(|| panic.downcast_ref::<String>().map(String::as_str));
     tracing::error!(
         "a request's handler panicked: {}",
-        said.unwrap_or("it did not say why")
+        message.unwrap_or("it did not say why")
     );
     let mut response = Problem::new(ProblemType::Internal).into_response();
     response.extensions_mut().insert(Panicked);

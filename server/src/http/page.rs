@@ -25,7 +25,8 @@ pub(in crate::http) const ROOT: &str = "/";
 pub(in crate::http) const FILES: &str = "/page/{file}";
 /// How the paths of what the page loads begin.
 const FILES_PREFIX: &str = "/page/";
-/// What the page may do: load what this server serves, ask this server, and nothing else.
+/// Content security policy of the page: it may load files from this server and send requests to it,
+/// and nothing else.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; \
     connect-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
     frame-ancestors 'none'";
@@ -93,20 +94,20 @@ impl File {
         } else {
             Body::from(self.plain).into_response()
         };
-        let said = response.headers_mut();
-        said.insert(header::CONTENT_TYPE, self.media_type.clone());
-        said.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
-        said.insert(header::VARY, HeaderValue::from_static("accept-encoding"));
-        said.insert(
+        let headers = response.headers_mut();
+        headers.insert(header::CONTENT_TYPE, self.media_type.clone());
+        headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
+        headers.insert(header::VARY, HeaderValue::from_static("accept-encoding"));
+        headers.insert(
             header::CONTENT_SECURITY_POLICY,
             HeaderValue::from_static(POLICY),
         );
         if zips && !is_known {
             let encoding = HeaderValue::from_static("gzip");
-            said.insert(header::CONTENT_ENCODING, encoding);
+            headers.insert(header::CONTENT_ENCODING, encoding);
         }
         if let Ok(tag) = HeaderValue::try_from(tag) {
-            said.insert(header::ETAG, tag);
+            headers.insert(header::ETAG, tag);
         }
         response
     }

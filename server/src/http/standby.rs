@@ -1,7 +1,8 @@
-//! The REST API of a standby: it answers what concerns the map alone, and has the server that has the database
-//! answer everything else.
+//! The REST API of a standby: it answers requests that read only the map, and forwards all others to the
+//! active server.
 //!
-//! What it would refuse is forwarded too, so the other server decides about it, counts it and audits it.
+//! It also forwards requests that it would refuse, so that the active server decides about them, counts them
+//! and records them in the audit log.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -106,12 +107,12 @@ impl Standby {
             .all(|age| age.is_some_and(|age| age <= MAP_AGE_MAX))
     }
 
-    /// Counts the connection of a request among those of its token or session, so that no flood of others
-    /// displaces it. The server that has the database decides what it may do; this one does not wait long to
-    /// know whose it is.
+    /// Authenticates a request, and counts its connection as one of its token or session, so that a flood of
+    /// unauthenticated connections does not displace it. A request that cannot be authenticated within
+    /// [`PROVE_MAX`] is forwarded without this. Permissions are checked by the active server.
     ///
     /// # Errors
-    /// The token has as many connections as it may.
+    /// The token or session has its maximum number of connections.
     async fn prove(&self, parts: &Parts) -> Result<Sharing, Problem> {
         let (Some(slot), Some(&Peer(address)), Some((text, shown))) = (
             parts.extensions.get::<Arc<Slot>>(),
@@ -142,7 +143,7 @@ async fn healthz(headers: HeaderMap) -> Result<Json<Health>, Problem> {
     Ok(super::health::ok())
 }
 
-/// Says whether this standby can answer all requests, alone or by the other server.
+/// Returns whether this standby can answer all requests, by itself or by forwarding them.
 fn ready(app: &App, forwarder: &Forwarder) -> Result<Json<Health>, Problem> {
     let unavailable = |detail: String| Err(Problem::new(ProblemType::Unavailable).detail(detail));
     match app.map_age() {

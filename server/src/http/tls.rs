@@ -14,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 
 use crate::app::App;
-use crate::authority::{Authorities, PORT_LASTS, Trusted};
+use crate::authority::{Authorities, PORT_CERTIFICATE_VALIDITY, Trusted};
 use crate::certificate::Certificate;
 use crate::clock::Clock;
 use crate::config::TlsFiles;
@@ -164,7 +164,9 @@ impl Tls {
             let now = issuer.clock.machine_time();
             certificate.not_after.duration_since(now)
         });
-        let is_fresh = |left: SignedDuration| left > PORT_LASTS * 2 / 3 && left <= PORT_LASTS;
+        let is_fresh = |left: SignedDuration| {
+            left > PORT_CERTIFICATE_VALIDITY * 2 / 3 && left <= PORT_CERTIFICATE_VALIDITY
+        };
         !(present.trusted.as_ref().is_some_and(is_same) && left.is_some_and(is_fresh))
     }
 

@@ -28,8 +28,8 @@ pub const LOCK_FIRST: Duration = Duration::from_secs(30);
 pub const LOCK_MAX: Duration = Duration::from_mins(15);
 /// Time without a failure after which the record of a source is reset.
 pub const FORGOTTEN_AFTER: Duration = Duration::from_hours(1);
-/// Maximum number of sources in memory; beyond it the one whose last failure is oldest is dropped,
-/// locked ones last.
+/// Maximum number of sources in memory. Beyond it the source with the oldest last failure is dropped;
+/// locked sources are dropped only if all are locked.
 pub const REMEMBERED_MAX: usize = 20_000;
 
 /// Key by which failures are counted.

@@ -36,7 +36,8 @@ impl Origin {
         split_host(authority).map_or(authority, |(host, _)| host)
     }
 
-    /// Returns whether nobody between can read what is sent there: by TLS, or on this machine.
+    /// Returns whether the connection to this origin cannot be read by others: it uses TLS or the
+    /// loopback.
     pub fn is_safe(&self) -> bool {
         let is_here = match address_of(self.host()) {
             Some(address) => address.is_loopback(),

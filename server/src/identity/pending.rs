@@ -13,7 +13,7 @@
 //!
 //! The server therefore stores nothing for a sign-in, and starting many sign-ins exhausts no
 //! memory. The provider's answer is accepted only from the browser that began the sign-in, for
-//! [`SIGN_IN_LASTS`]. Without the key nobody can compute the state of a cookie.
+//! [`SIGN_IN_TIMEOUT`]. Without the key nobody can compute the state of a cookie.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
@@ -21,7 +21,7 @@ use jiff::{SignedDuration, Timestamp};
 use ring::hmac;
 
 /// Maximum time from the start of a sign-in to the provider's answer; a later answer is refused.
-pub const SIGN_IN_LASTS: SignedDuration = SignedDuration::from_mins(10);
+pub const SIGN_IN_TIMEOUT: SignedDuration = SignedDuration::from_mins(10);
 /// Number of random bytes in the cookie of a sign-in, and in a [`PendingKey`].
 pub const SIGN_IN_RANDOM_BYTES: usize = 32;
 /// Maximum length of a sign-in cookie, in bytes; a longer one is refused.
@@ -97,7 +97,7 @@ impl Pending {
     /// Restores the sign-in from what the browser presents.
     ///
     /// Returns `None` if `state` was not derived from `cookie` with `key`, or if the sign-in began
-    /// [`SIGN_IN_LASTS`] ago or earlier.
+    /// [`SIGN_IN_TIMEOUT`] ago or earlier.
     pub fn resume(key: &PendingKey, presented: Presented<'_>, now: Timestamp) -> Option<Self> {
         use subtle::ConstantTimeEq as _;
         let Presented { cookie, state } = presented;
@@ -112,7 +112,7 @@ impl Pending {
         let (began_s, _random) = cookie.split_once('.')?;
         let began = Timestamp::from_second(began_s.parse().ok()?).ok()?;
         let age = now.duration_since(began);
-        (age < SIGN_IN_LASTS).then_some(pending)
+        (age < SIGN_IN_TIMEOUT).then_some(pending)
     }
 }
 

@@ -19,7 +19,7 @@ use clap::Args;
 use jiff::Timestamp;
 
 use super::review::{self, Review};
-use super::unfinished::{BESIDE, Unfinished, with_ending};
+use super::unfinished::{SQLITE_SUFFIXES, Unfinished, with_ending};
 use super::{ServerFiles, file_of};
 use crate::app::backups::check_space;
 use crate::authority::{AuthorityError, CERTIFICATE_FILE, copies};
@@ -37,7 +37,7 @@ use crate::paths::folder_of;
 /// Suffix of the database while it is restored.
 const RESTORING_ENDING: &str = ".restoring";
 /// Infix of the names of files and folders that were moved aside.
-const ASIDE: &str = ".before-restore-";
+const REPLACED_INFIX: &str = ".before-restore-";
 /// Free space for the log of the database while it is prepared, MiB.
 const LOG_MIB: u64 = 16;
 const BYTES_PER_MIB: u64 = 1024 * 1024;
@@ -129,15 +129,16 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
         )?,
         None => AuthorityOutcome::None,
     };
-    let aside = replace(&database, restoring, now).await?;
+    let replaced = replace(&database, restoring, now).await?;
     file_owner::chown_database(&database)?;
-    if let AuthorityOutcome::Restored(folder, aside) = &authority {
-        for folder in aside.iter().chain([folder]) {
+    if let AuthorityOutcome::Restored(folder, replaced) = &authority {
+        for folder in replaced.iter().chain([folder]) {
             file_owner::chown_to_parents_owner(folder)?;
         }
     }
     let mut out = io::stdout().lock();
-    print_outcome(&mut out, (&database, aside), &restoration, &review).context("cannot print")?;
+    print_outcome(&mut out, (&database, replaced), &restoration, &review)
+        .context("cannot print")?;
     print_authority_outcome(&mut out, &authority, &manifest).context("cannot print")?;
     Ok(())
 }
@@ -216,7 +217,7 @@ async fn replace(
     // SQLite would use a log beside the new database as that database's log, also where there is no
     // old one. After a crash here the old database lacks its log, which is among the files that were
     // moved aside.
-    for ending in BESIDE {
+    for ending in SQLITE_SUFFIXES {
         let beside = with_ending(database, ending);
         if beside.exists() {
             let renamed = fs::rename(&beside, with_ending(&to, ending));
@@ -236,7 +237,7 @@ async fn replace(
 /// Returns a name that no other file has: of two restorations within a second, the second has a number.
 fn unused_name(path: &Path, now: Timestamp) -> PathBuf {
     let time = now.strftime("%Y%m%dT%H%M%SZ");
-    let first = with_ending(path, &format!("{ASIDE}{time}"));
+    let first = with_ending(path, &format!("{REPLACED_INFIX}{time}"));
     let numbered = (2_u32..).map(|number| with_ending(&first, &format!("-{number}")));
     let mut names = std::iter::once(first.clone()).chain(numbered);
     names.find(|name| !name.exists()).unwrap_or(first)
@@ -301,22 +302,22 @@ fn restore_authority(
     if is_there && !replace {
         return Ok(AuthorityOutcome::Kept(folder.to_owned()));
     }
-    let mut aside = None;
+    let mut replaced = None;
     if folder.exists() {
         let to = unused_name(folder, now);
         fs::rename(folder, &to).map_err(|cause| AuthorityError::Unwritable {
             path: folder.to_owned(),
             cause,
         })?;
-        aside = Some(to);
+        replaced = Some(to);
     }
     copies::write_files(folder, files)?;
-    Ok(AuthorityOutcome::Restored(folder.to_owned(), aside))
+    Ok(AuthorityOutcome::Restored(folder.to_owned(), replaced))
 }
 
 fn print_outcome(
     out: &mut impl Write,
-    (database, aside): (&Path, Option<PathBuf>),
+    (database, replaced): (&Path, Option<PathBuf>),
     restoration: &Restoration,
     review: &Review,
 ) -> io::Result<()> {
@@ -328,8 +329,8 @@ fn print_outcome(
         "`{}` is restored from a backup of {taken_at:.0} by tread-server {version}",
         database.display()
     )?;
-    if let Some(aside) = aside {
-        writeln!(out, "the old database is `{}`", aside.display())?;
+    if let Some(replaced) = replaced {
+        writeln!(out, "the old database is `{}`", replaced.display())?;
     }
     review.write(out)
 }
@@ -352,14 +353,14 @@ fn print_authority_outcome(
              of the backup",
             folder.display()
         ),
-        AuthorityOutcome::Restored(folder, aside) => {
+        AuthorityOutcome::Restored(folder, replaced) => {
             writeln!(
                 out,
                 "the fleet's authority is restored to `{}`",
                 folder.display()
             )?;
-            match aside {
-                Some(aside) => writeln!(out, "the old one is in `{}`", aside.display()),
+            match replaced {
+                Some(replaced) => writeln!(out, "the old one is in `{}`", replaced.display()),
                 None => Ok(()),
             }
         }

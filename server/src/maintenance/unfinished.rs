@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, ensure};
 
 /// Suffixes of SQLite's files beside a database.
-pub(super) const BESIDE: [&str; 3] = ["-wal", "-shm", "-journal"];
+pub(super) const SQLITE_SUFFIXES: [&str; 3] = ["-wal", "-shm", "-journal"];
 
 /// Returns a path with a suffix.
 pub(super) fn with_ending(path: &Path, ending: &str) -> PathBuf {
@@ -49,7 +49,7 @@ impl Unfinished {
     /// # Errors
     /// A connection is open.
     pub(super) fn check_closed(&self) -> anyhow::Result<()> {
-        for ending in BESIDE {
+        for ending in SQLITE_SUFFIXES {
             let beside = with_ending(&self.path, ending);
             ensure!(!beside.exists(), "`{}` is still in use", beside.display());
         }
@@ -79,7 +79,7 @@ impl Unfinished {
     }
 
     fn remove(&self) -> io::Result<()> {
-        for ending in BESIDE.into_iter().chain([""]) {
+        for ending in SQLITE_SUFFIXES.into_iter().chain([""]) {
             remove_if_there(&with_ending(&self.path, ending))?;
         }
         Ok(())
@@ -95,13 +95,13 @@ impl Drop for Unfinished {
     }
 }
 
-/// Refuses the name of a new database if there is such a file, or one of SQLite's beside it, which SQLite
-/// would take for the new one's.
+/// Checks that neither the file of a new database exists, nor a log or lock file of SQLite with its name:
+/// SQLite would treat such a file as one of the new database.
 ///
 /// # Errors
-/// There is such a file.
+/// One of these files exists.
 pub(super) fn check_absent(database: &Path) -> anyhow::Result<()> {
-    for ending in BESIDE.into_iter().chain([""]) {
+    for ending in SQLITE_SUFFIXES.into_iter().chain([""]) {
         let file = with_ending(database, ending);
         ensure!(
             file.symlink_metadata().is_err(),

@@ -94,9 +94,9 @@ impl HttpClient {
 
     /// Fetches the claims of a person from the provider's user info endpoint.
     pub(super) async fn claims(&self, url: &Url, access_token: &str) -> Result<Claims, HttpError> {
-        let asked = self.0.get(url.clone()).bearer_auth(access_token);
-        let asked = asked.header("accept", "application/json").build()?;
-        let answer = self.answer(asked).await?;
+        let request = self.0.get(url.clone()).bearer_auth(access_token);
+        let request = request.header("accept", "application/json").build()?;
+        let answer = self.answer(request).await?;
         if !answer.status().is_success() {
             return Err(HttpError::Status(answer.status().as_u16()));
         }

@@ -156,15 +156,15 @@ pub struct Provider {
     known: RwLock<Option<Arc<ProviderMetadataWithLogout>>>,
     /// Held during a request for the provider's keys. It orders these requests, so the latest keys
     /// win, and other sign-ins wait for the new keys instead of failing.
-    keys_turn: tokio::sync::Mutex<KeysAsked>,
+    key_request: tokio::sync::Mutex<LastKeyRequest>,
 }
 
 /// Monotonic time of the last request for the provider's keys, and whether it succeeded; `None`
 /// before the first.
 #[derive(Debug, Default)]
-struct KeysAsked(Option<(Duration, bool)>);
+struct LastKeyRequest(Option<(Duration, bool)>);
 
-impl KeysAsked {
+impl LastKeyRequest {
     /// Returns whether the last request succeeded if it is too early for another; `None` if a new
     /// one is allowed.
     fn recently(&self, now: Duration) -> Option<bool> {
@@ -212,7 +212,7 @@ impl Provider {
             http: HttpClient::new(config.ca.as_deref(), config.issuer.starts_with("https:"))?,
             clock,
             known: RwLock::default(),
-            keys_turn: tokio::sync::Mutex::default(),
+            key_request: tokio::sync::Mutex::default(),
         })
     }
 
@@ -226,7 +226,7 @@ impl Provider {
     /// # Errors
     /// [`DiscoverError`]; metadata of an earlier discovery stay in use.
     pub async fn discover(&self) -> Result<(), DiscoverError> {
-        let _turn = self.keys_turn.lock().await;
+        let _turn = self.key_request.lock().await;
         let found = ProviderMetadataWithLogout::discover_async(self.issuer.clone(), &self.http);
         let found = found
             .await
@@ -340,16 +340,16 @@ impl Provider {
     ) -> Result<AuthenticatedPerson, ExchangeError> {
         let metadata = self.metadata().ok_or(ExchangeError::Unknown)?;
         let client = self.client(&metadata);
-        let asked = client
+        let request = client
             .exchange_code(AuthorizationCode::new(code.to_owned()))
             .map_err(|error| ExchangeError::Unanswered(Box::new(error)))?
             .set_pkce_verifier(PkceCodeVerifier::new(pending.verifier.clone()));
-        let answer = asked.request_async(&self.http).await.map_err(refused)?;
+        let answer = request.request_async(&self.http).await.map_err(refused)?;
         let id_token = answer
             .id_token()
             .ok_or(ExchangeError::Invalid(InvalidIdToken::Missing))?;
         let access_token = answer.access_token();
-        let looked_at = |keys: &JsonWebKeySet<CoreJsonWebKey>| {
+        let verified_with = |keys: &JsonWebKeySet<CoreJsonWebKey>| {
             let expected = ExpectedClaims {
                 issuer: &self.issuer,
                 client_id: &self.client_id,
@@ -360,34 +360,34 @@ impl Provider {
             };
             verify::claims(id_token, &expected)
         };
-        let mut held_against = Arc::clone(&metadata);
-        let mut believed = looked_at(held_against.jwks());
+        let mut metadata_used = Arc::clone(&metadata);
+        let mut verified = verified_with(metadata_used.jwks());
         for _ in 1..KEYS_TRIED_MAX {
-            let Err(InvalidIdToken::Signature(_)) = &believed else {
+            let Err(InvalidIdToken::Signature(_)) = &verified else {
                 break;
             };
-            let asking = tokio::time::timeout(http::ANSWER_MAX, self.newer_than(&held_against));
-            let asked = asking.await.unwrap_or(Err(ExchangeError::KeysUnknown));
-            let Some(newer) = asked? else {
+            let fetching = tokio::time::timeout(http::ANSWER_MAX, self.newer_than(&metadata_used));
+            let fetched = fetching.await.unwrap_or(Err(ExchangeError::KeysUnknown));
+            let Some(newer) = fetched? else {
                 break;
             };
-            held_against = newer;
-            believed = looked_at(held_against.jwks());
+            metadata_used = newer;
+            verified = verified_with(metadata_used.jwks());
         }
-        let (subject, mut claims) = believed.map_err(ExchangeError::Invalid)?;
+        let (subject, mut claims) = verified.map_err(ExchangeError::Invalid)?;
         if claim(&claims, &self.groups_claim).is_none()
             && let Some(endpoint) = metadata.userinfo_endpoint()
         {
-            let said = self.http.claims(endpoint.url(), access_token.secret());
-            let said = said.await;
-            let said = said.map_err(|error| match error {
+            let user_info = self.http.claims(endpoint.url(), access_token.secret());
+            let user_info = user_info.await;
+            let user_info = user_info.map_err(|error| match error {
                 HttpError::NoObject => ExchangeError::Malformed(Box::new(error)),
                 error @ (HttpError::Failed(_)
                 | HttpError::TooLarge
                 | HttpError::Status(_)
                 | HttpError::NoAnswer) => ExchangeError::Unanswered(Box::new(error)),
             })?;
-            claims = with_user_info((claims, said), &self.groups_claim)?;
+            claims = with_user_info((claims, user_info), &self.groups_claim)?;
         }
         let id_token = id_token.to_string();
         Ok(AuthenticatedPerson {
@@ -407,24 +407,24 @@ impl Provider {
         &self,
         known: &Arc<ProviderMetadataWithLogout>,
     ) -> Result<Option<Arc<ProviderMetadataWithLogout>>, ExchangeError> {
-        let mut asked = self.keys_turn.lock().await;
+        let mut last_request = self.key_request.lock().await;
         let present = self.metadata().ok_or(ExchangeError::Unknown)?;
         if !Arc::ptr_eq(&present, known) {
             return Ok(Some(present));
         }
         let now = self.clock.elapsed();
-        match asked.recently(now) {
+        match last_request.recently(now) {
             Some(true) => return Ok(None),
             Some(false) => return Err(ExchangeError::KeysUnknown),
             None => {}
         }
-        *asked = KeysAsked(Some((now, false)));
+        *last_request = LastKeyRequest(Some((now, false)));
         let keys = JsonWebKeySet::fetch_async(present.jwks_uri(), &self.http);
         let keys = keys.await.map_err(|error| {
             tracing::warn!("cannot ask the OpenID provider for its keys: {error}");
             ExchangeError::KeysUnknown
         })?;
-        *asked = KeysAsked(Some((now, true)));
+        *last_request = LastKeyRequest(Some((now, true)));
         self.set_metadata((*present).clone().set_jwks(keys));
         Ok(self.metadata())
     }
@@ -436,11 +436,11 @@ impl Provider {
 /// # Errors
 /// [`ExchangeError::UserInfo`] if the user info is not about the subject of the ID token.
 fn with_user_info(
-    (mut claims, said): (Claims, Claims),
+    (mut claims, user_info): (Claims, Claims),
     groups_claim: &str,
 ) -> Result<Claims, ExchangeError> {
     let subject = |of: &Claims| of.get("sub")?.as_str().map(str::to_owned);
-    if subject(&said).is_none_or(|said| subject(&claims) != Some(said)) {
+    if subject(&user_info).is_none_or(|user_info| subject(&claims) != Some(user_info)) {
         let detail = "its user info is about somebody else".to_owned();
         return Err(ExchangeError::UserInfo(detail));
     }
@@ -449,7 +449,7 @@ fn with_user_info(
         let rest = groups_claim.strip_prefix(name);
         rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     };
-    for (name, value) in said {
+    for (name, value) in user_info {
         if leads_to_groups(&name) {
             claims.insert(name, value);
         } else {
@@ -464,10 +464,10 @@ type TokenError = RequestTokenError<HttpError, StandardErrorResponse<CoreErrorRe
 /// Distinguishes a refused code, a malformed answer and a failed request.
 fn refused(error: TokenError) -> ExchangeError {
     match error {
-        RequestTokenError::ServerResponse(said) => {
-            let said = serde_json::to_value(said.error()).unwrap_or_default();
-            let said = said.as_str().unwrap_or_default();
-            ExchangeError::Refused(tread_api::text::cleaned(said, 80))
+        RequestTokenError::ServerResponse(response) => {
+            let response = serde_json::to_value(response.error()).unwrap_or_default();
+            let response = response.as_str().unwrap_or_default();
+            ExchangeError::Refused(tread_api::text::cleaned(response, 80))
         }
         error @ RequestTokenError::Parse(..) => ExchangeError::Malformed(Box::new(error)),
         error @ (RequestTokenError::Request(_) | RequestTokenError::Other(_)) => {

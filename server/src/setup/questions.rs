@@ -36,7 +36,7 @@ impl<'a> Questions<'a> {
         writeln!(self.output, "{text}").context("cannot print")
     }
 
-    /// Asks until `read` accepts the answer. An empty answer stands for the default.
+    /// Repeats the question until `read` accepts the answer. An empty answer means the default.
     ///
     /// # Errors
     /// Nobody answers, or no answer is valid.

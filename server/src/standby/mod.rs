@@ -1,5 +1,5 @@
-//! A standby while it waits for the database: what it says in its log and to the service manager, and the
-//! requests that it answers meanwhile ([`serving`]).
+//! A standby that waits for the lock of the database: its log lines, its messages to the service manager, and
+//! the requests that it answers while it waits ([`serving`]).
 
 pub(crate) mod serving;
 
@@ -17,8 +17,8 @@ use crate::config::Config;
 use crate::db::lock::{DatabaseLock, LockError};
 use crate::service_manager::notify;
 
-/// Silence of the server that has the database after which a standby takes over: ten questions that it has
-/// not asked, and as long as its robots wait for its pulse.
+/// Silence of the active server after which a standby takes over: ten times the interval at which the active
+/// server queries the database.
 const SILENCE_MAX: Duration = Duration::from_secs(1);
 
 /// Interval of the log lines of a standby that waits for the same reason.
@@ -27,31 +27,31 @@ const LOG_EVERY: Duration = Duration::from_mins(10);
 /// Interval at which the watchdog is fed while it takes over.
 const FEED_EVERY: Duration = Duration::from_secs(5);
 
-/// The lock of the database, and what a standby has that took it.
+/// The lock of the database and, if a standby took it, the state that the standby has read.
 #[derive(Debug)]
 pub(crate) struct AcquiredLock {
     /// The lock.
     pub(crate) lock: DatabaseLock,
-    /// What has the map, if this process was a standby that had read it.
+    /// The app with the map, if this process was a standby that had read the map.
     pub(crate) standby: Option<App>,
     /// Feeds the watchdog until it is dropped, if this process was a standby.
     _feeding: JoinSet<()>,
 }
 
-/// Locks the database; a standby waits until it can, and answers requests meanwhile. `None` if it is asked to
-/// stop before.
+/// Locks the database. A standby waits for the lock and answers requests while it waits. Returns `None` if a
+/// stop is requested before the lock is taken.
 ///
 /// # Errors
-/// Another server uses it, or it cannot be locked.
+/// Another server has the lock and this one is no standby, or the database cannot be locked.
 pub(crate) async fn acquire_lock(
-    asked: impl Future<Output = ()>,
+    stop_requested: impl Future<Output = ()>,
     config: &Config,
     clock: &Clock,
 ) -> Result<Option<AcquiredLock>, LockError> {
     if !config.standby {
         let lock = tokio::select! {
             lock = DatabaseLock::take(&config.database) => lock?,
-            () = asked => return Ok(None),
+            () = stop_requested => return Ok(None),
         };
         return Ok(Some(AcquiredLock {
             lock,
@@ -70,7 +70,7 @@ pub(crate) async fn acquire_lock(
     };
     let lock = tokio::select! {
         lock = DatabaseLock::wait(&config.database, SILENCE_MAX, waiting) => Some(lock?),
-        () = asked => None,
+        () = stop_requested => None,
     };
     let Some(lock) = lock else {
         notify(&[NotifyState::Stopping]);
@@ -101,8 +101,8 @@ struct Standby {
 }
 
 impl Standby {
-    /// Says why it waits. To be called often: it feeds the watchdog of the service manager too, since a
-    /// standby that waits does what it is for.
+    /// Logs the reason of the wait if it has changed, and feeds the watchdog of the service manager. Call it
+    /// more often than the watchdog's timeout: waiting is normal operation of a standby.
     fn waits(&mut self, reason: &str) {
         let is_new =
             |(logged, at): &(String, Instant)| logged != reason || at.elapsed() >= LOG_EVERY;
@@ -119,8 +119,8 @@ impl Standby {
         notify(&[NotifyState::Watchdog]);
     }
 
-    /// Says that it takes over, if it has waited, and feeds the watchdog until what it returns is dropped:
-    /// migrations and the map may take long.
+    /// Logs the takeover if it has waited, and feeds the watchdog until the returned set is dropped, because
+    /// migrations and loading the map may take longer than the watchdog's timeout.
     fn takes_over(&self) -> JoinSet<()> {
         let mut feeding = JoinSet::new();
         if self.logged.is_some() {

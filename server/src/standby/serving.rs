@@ -62,8 +62,8 @@ impl StandbyServing {
         }
     }
 
-    /// Accepts no further connections, and frees the addresses; what is open ends soon. Returns what has the
-    /// map, if it was read.
+    /// Stops listening, frees the addresses, and ends the open requests. Returns the app with the map, if the
+    /// map was read.
     pub(crate) async fn end(mut self) -> Option<App> {
         self.tokens.given_up.cancel();
         self.tokens.stop.cancel();

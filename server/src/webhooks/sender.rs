@@ -251,7 +251,7 @@ async fn judge(answer: Response) -> Attempt {
     } else if status.is_redirection() {
         Some("the receiver redirects, which is not followed: give its final URL".to_owned())
     } else {
-        Some(said(status, answer).await)
+        Some(response_text(status, answer).await)
     };
     Attempt {
         status: Some(status.as_u16()),
@@ -260,7 +260,7 @@ async fn judge(answer: Response) -> Attempt {
 }
 
 /// Returns what an answer that is an error says, as far as it fits.
-async fn said(status: StatusCode, mut answer: Response) -> String {
+async fn response_text(status: StatusCode, mut answer: Response) -> String {
     let mut body = Vec::new();
     while let Ok(Some(chunk)) = answer.chunk().await {
         let room = BODY_MAX - body.len();

@@ -16,7 +16,7 @@ use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{Batch, Receipt, Record, RecordContent};
 use tread_api::wire::{Refusal, RefusalCode};
 use tread_samples::rover;
-use tread_server::app::friction::{Area, CellsAsked, ReadingParameters};
+use tread_server::app::friction::{Area, CellRequest, ReadingParameters};
 use tread_server::app::ingest::{Upload, Writer};
 use tread_server::app::{App, AppError};
 use tread_server::clock::Clock;
@@ -200,17 +200,17 @@ impl Ground {
     async fn said(&self, app: &App) -> String {
         let mut said = Vec::new();
         for as_of in [None, Some(now() - Duration::from_hours(39))] {
-            let cells = CellsAsked {
+            let cells = CellRequest {
                 area: Area::WHOLE,
                 resolution_m: None,
                 cursor: None,
                 limit: 1_000,
             };
-            let asked = ReadingParameters {
+            let parameters = ReadingParameters {
                 as_of,
                 ..ReadingParameters::default()
             };
-            let page = app.friction_of_cells(&self.site, &asked, cells).await;
+            let page = app.friction_of_cells(&self.site, &parameters, cells).await;
             said.push(page.unwrap().items);
         }
         format!("{said:?}")

@@ -11,7 +11,7 @@ use tread_api::page::{MapPage, Page};
 use tread_api::robot::Robot as ShownRobot;
 use tread_api::wire::ingest::{Batch, Receipt, Record};
 use tread_server::app::App;
-use tread_server::app::friction::{Area, CellsAsked, ReadingParameters};
+use tread_server::app::friction::{Area, CellRequest, ReadingParameters};
 use tread_server::app::ingest::Upload;
 use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::friction::epoch_h;
@@ -262,14 +262,16 @@ pub(crate) async fn restarted(app: &App) -> App {
 
 /// What the map says of all cells.
 pub(crate) async fn said(app: &App) -> MapPage<CellFriction> {
-    let cells = CellsAsked {
+    let cells = CellRequest {
         area: Area::WHOLE,
         resolution_m: None,
         cursor: None,
         limit: 1_000,
     };
-    let asked = ReadingParameters::default();
-    app.friction_of_cells(&site(), &asked, cells).await.unwrap()
+    let parameters = ReadingParameters::default();
+    app.friction_of_cells(&site(), &parameters, cells)
+        .await
+        .unwrap()
 }
 
 /// Merges all that the horizons have passed, with a kill after each transaction; the map must stay

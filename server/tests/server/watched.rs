@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use tokio::task::JoinSet;
 use tread_api::wire::state::WATCHED_STATE_RATE_HZ;
-use tread_server::app::watched::{ASK_FOR, ASK_PERIOD, TRIES_MAX};
+use tread_server::app::watched::{REQUEST_DURATION, REQUEST_PERIOD, TRIES_MAX};
 
 use crate::drive::Socket;
 use crate::harness::{Yard, eventually};
@@ -43,11 +43,11 @@ async fn a_watched_robot_is_asked_once_however_many_watch_it() {
     for pair in heard.windows(2) {
         let apart = pair[1].0 - pair[0].0;
         // The first answer may have taken a while.
-        assert!(apart > ASK_PERIOD / 2, "{apart:?}");
+        assert!(apart > REQUEST_PERIOD / 2, "{apart:?}");
     }
     for (_, request) in heard {
         assert!((request.rate_hz - WATCHED_STATE_RATE_HZ).abs() < 1e-9);
-        assert_eq!(Duration::from_millis(request.for_ms), ASK_FOR);
+        assert_eq!(Duration::from_millis(request.for_ms), REQUEST_DURATION);
     }
     assert!(other.state_rates().is_empty(), "nobody watches it");
     drop(sockets);

@@ -12,7 +12,7 @@ use tokio_tungstenite::tungstenite::ClientRequestBuilder;
 use tread_api::ids::RobotId;
 use tread_api::keys::{self, Key};
 use tread_api::robot::Alert;
-use tread_server::app::watched::ASK_FOR;
+use tread_server::app::watched::REQUEST_DURATION;
 use tread_tests::fleet::{Fleet, SITE};
 use tread_tests::wait::{SHORT, eventually};
 use zenoh::Wait as _;
@@ -28,7 +28,7 @@ const RAISED_WITHIN: Duration = Duration::from_secs(2);
 /// Span over which a rate is measured.
 const SPAN: Duration = Duration::from_secs(1);
 /// Longest time after the last request after which the rate is measured as the robot's own.
-const BACK_WITHIN: Duration = ASK_FOR.saturating_add(Duration::from_secs(3));
+const BACK_WITHIN: Duration = REQUEST_DURATION.saturating_add(Duration::from_secs(3));
 
 /// Arrivals of states at the server's router, by robot.
 #[derive(Debug, Clone, Default)]

@@ -153,10 +153,10 @@ async fn reach(client: &Client) -> Result<Vec<Finding>, ClientError> {
         clippy::disallowed_methods,
         reason = "the time of the answer is measured"
     )]
-    let asked_at = Instant::now();
+    let sent_at = Instant::now();
     let answer = client.request(Method::GET, "/healthz").send().await;
     let answer = answer.map_err(|cause| client.lost(cause))?;
-    let took = asked_at.elapsed();
+    let round_trip = sent_at.elapsed();
     if !answer.status().is_success() {
         return Err(client.refusal(answer).await);
     }
@@ -165,14 +165,14 @@ async fn reach(client: &Client) -> Result<Vec<Finding>, ClientError> {
     let text = format!(
         "{} answers {by}, after {} ms",
         client.address(),
-        took.as_millis()
+        round_trip.as_millis()
     );
-    let said = answer.headers().get(header::DATE);
-    let said = said
+    let server_time = answer.headers().get(header::DATE);
+    let server_time = server_time
         .and_then(|date| date.to_str().ok())
         .and_then(|date| rfc2822::parse(date).ok());
     let mut findings = vec![Finding::on("server").ok(text)];
-    findings.extend(said.map(|said| clock(&said, now(), took)));
+    findings.extend(server_time.map(|server_time| clock(&server_time, now(), round_trip)));
     findings.extend(readiness(client).await);
     Ok(findings)
 }
@@ -190,12 +190,12 @@ async fn readiness(client: &Client) -> Option<Finding> {
 }
 
 /// Compares the server's clock with that of this machine.
-fn clock(said: &Zoned, now: Timestamp, took: Duration) -> Finding {
-    let said = said.timestamp();
+fn clock(server_time: &Zoned, now: Timestamp, round_trip: Duration) -> Finding {
+    let server_time = server_time.timestamp();
     // The header has whole seconds, and the server wrote it during the request.
-    let slack = SignedDuration::try_from(took).unwrap_or(SignedDuration::ZERO)
+    let slack = SignedDuration::try_from(round_trip).unwrap_or(SignedDuration::ZERO)
         + SignedDuration::from_secs(1);
-    let difference = said.duration_since(now);
+    let difference = server_time.duration_since(now);
     if difference.abs() <= CLOCK_DIFFERENCE_MAX + slack {
         return Finding::on("clock").ok("the server's and this machine's agree");
     }
@@ -209,7 +209,7 @@ fn clock(said: &Zoned, now: Timestamp, took: Duration) -> Finding {
     );
     Finding::on("clock").problem(
         format!(
-            "the server's is {seconds} s {which} this machine's: it says {said}, and this machine \
+            "the server's is {seconds} s {which} this machine's: it says {server_time}, and this machine \
              {now:.0}"
         ),
         NextStep(

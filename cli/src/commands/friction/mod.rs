@@ -34,10 +34,10 @@ fn save(picture: &[u8], file: &Path, output: Output) -> anyhow::Result<()> {
 async fn history(
     (client, output): (&Client, Output),
     site: &SiteId,
-    asked: &HistoryArguments,
+    arguments: &HistoryArguments,
 ) -> anyhow::Result<()> {
-    let (times, reading) = (asked.times(), asked.models.reading());
-    match &asked.place {
+    let (times, reading) = (arguments.times(), arguments.models.reading());
+    match &arguments.place {
         HistoryPlace::Terrain(terrain) => {
             let read = client.terrain_history((site, terrain), times, reading);
             output.show(&read.await?, tables::terrain_history)
@@ -64,8 +64,8 @@ pub(super) async fn run(
             let read = client.terrain_friction(site, terrain.as_ref(), reading.reading());
             output.show(&read.await?, |terrains| tables::terrains(terrains))?;
         }
-        Some(FrictionAction::History(asked)) => {
-            history((client, output), site, &asked).await?;
+        Some(FrictionAction::History(arguments)) => {
+            history((client, output), site, &arguments).await?;
         }
         Some(FrictionAction::Cells {
             area,

@@ -219,13 +219,13 @@ pub(super) fn path(path: &PathFriction) -> String {
             format!("{:.2}", piece.speed_m_s),
         ]);
     }
-    let said = format!(
+    let text = format!(
         "{:.1} m, {:.0} % of it measured\n{}",
         path.length_m,
         1e2 * path.known_ratio,
         render(&table)
     );
-    of_time(MapTimes::as_of(path.as_of), &said)
+    of_time(MapTimes::as_of(path.as_of), &text)
 }
 
 /// Whether the standard deviation is below θ itself.

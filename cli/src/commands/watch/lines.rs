@@ -11,19 +11,19 @@ use crate::commands::robots::{link_name, mode_name};
 
 /// Maximum number of objects whose last line is kept; beyond it, all are dropped and printed once
 /// more.
-const SAID_MAX: usize = 100_000;
+const PRINTED_MAX: usize = 100_000;
 
 /// Last line printed for each object.
 #[derive(Debug, Default)]
 pub(super) struct Lines {
-    said: HashMap<String, String>,
+    printed: HashMap<String, String>,
 }
 
 impl Lines {
     /// Returns the line for an event; `None` if it equals the last line of the object, or the event
     /// has none.
     pub(super) fn take(&mut self, event: &Event) -> Option<String> {
-        let (thing, text) = match event {
+        let (object, text) = match event {
             Event::Robot(robot) => (format!("robot    {}", robot.id), robot_text(robot)),
             Event::Mission(mission) => {
                 let reason = mission.reason.as_deref().filter(|text| !text.is_empty());
@@ -57,14 +57,14 @@ impl Lines {
                 return None;
             }
         };
-        if self.said.get(&thing) == Some(&text) {
+        if self.printed.get(&object) == Some(&text) {
             return None;
         }
-        if self.said.len() >= SAID_MAX {
-            self.said.clear();
+        if self.printed.len() >= PRINTED_MAX {
+            self.printed.clear();
         }
-        let line = format!("{}  {thing}  {text}", now());
-        self.said.insert(thing, text);
+        let line = format!("{}  {object}  {text}", now());
+        self.printed.insert(object, text);
         Some(line)
     }
 }

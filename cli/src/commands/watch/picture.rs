@@ -13,11 +13,11 @@ use tread_api::safety::StandstillState;
 use super::site_state::SiteState;
 use super::view::{Order, Section, View};
 use crate::commands::mission_text::{state, trajectory};
-use crate::commands::robots::{details, link_name, mode_name, steps_come, theta};
+use crate::commands::robots::{details, link_name, mode_name, steps_driven, theta};
 use crate::output::{age, fixed, or_dash};
 
 /// Maximum width of a robot's name, columns.
-const NAME_MOST: usize = 24;
+const NAME_WIDTH_MAX: usize = 24;
 /// Width of a progress bar, columns.
 const BAR: usize = 10;
 /// Minimum width of the screen, columns, for whole identifiers and additional columns of robots.
@@ -68,7 +68,14 @@ pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
         Constraint::Length(rows(known.robots().count(), most.max(3) - 2))
     };
     let below = rows(missions.len(), MISSION_ROWS).min(MISSION_ROWS_LEAST);
-    let [heading, robots_area, missions_area, alerts_area, said, keys] = Layout::vertical([
+    let [
+        heading,
+        robots_area,
+        missions_area,
+        alerts_area,
+        result,
+        keys,
+    ] = Layout::vertical([
         Constraint::Length(2),
         above,
         Constraint::Min(below),
@@ -90,8 +97,8 @@ pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
     if alert_rows > 0 {
         draw_alerts(frame, alerts_area, picture);
     }
-    let text = shown.said.as_deref().unwrap_or_default();
-    frame.render_widget(Paragraph::new(text).style(bold(Color::Yellow)), said);
+    let text = shown.result.as_deref().unwrap_or_default();
+    frame.render_widget(Paragraph::new(text).style(bold(Color::Yellow)), result);
     let dim = Style::new().add_modifier(Modifier::DIM);
     frame.render_widget(Paragraph::new(KEYS).style(dim), keys);
 }
@@ -147,7 +154,7 @@ fn head(picture: &Picture<'_>) -> Vec<Line<'static>> {
 
 /// Returns a progress bar of a mission.
 fn bar(progress: Option<MissionProgress>) -> String {
-    let Some((progress, full)) = progress.and_then(|it| Some((it, steps_come(it, BAR)?))) else {
+    let Some((progress, full)) = progress.and_then(|it| Some((it, steps_driven(it, BAR)?))) else {
         return "-".to_owned();
     };
     let share = (progress.driven_m / progress.length_m).clamp(0.0, 1.0);
@@ -238,7 +245,7 @@ fn draw_robots(frame: &mut Frame<'_>, area: Rect, picture: &Picture<'_>) {
         "ROBOT", "LINK", "MODE", "DONE", "M/S", "OFF MM", "THETA", "HEARD",
     ];
     let names = robots.iter().map(|robot| robot.id.as_str().len());
-    let longest = names.max().unwrap_or_default().clamp(8, NAME_MOST);
+    let longest = names.max().unwrap_or_default().clamp(8, NAME_WIDTH_MAX);
     let mut widths = vec![
         Constraint::Length(u16::try_from(longest).unwrap_or_default()),
         Constraint::Length(7),

@@ -42,7 +42,7 @@ pub(super) struct Screen<'client> {
     known: SiteState,
     shown: View,
     /// Requests without an answer yet.
-    asked: FuturesUnordered<BoxFuture<'client, String>>,
+    requests: FuturesUnordered<BoxFuture<'client, String>>,
 }
 
 /// Guard that restores the terminal when dropped, also on a panic.
@@ -62,7 +62,7 @@ impl<'client> Screen<'client> {
             every: arguments.every,
             known: SiteState::default(),
             shown: View::default(),
-            asked: FuturesUnordered::new(),
+            requests: FuturesUnordered::new(),
         }
     }
 
@@ -99,7 +99,7 @@ impl<'client> Screen<'client> {
                     }
                     ticks.reset_immediately();
                 }
-                Some(said) = self.asked.next() => self.shown.said = Some(said),
+                Some(result) = self.requests.next() => self.shown.result = Some(result),
                 _ = ticks.tick() => {
                     self.shown.mark(&self.known);
                     let picture = Picture {
@@ -141,7 +141,7 @@ impl<'client> Screen<'client> {
             let is_end = matches!(key.code, KeyCode::Char('c' | 'd'));
             return is_end.then_some(KeyAction::Quit);
         }
-        self.shown.said = None;
+        self.shown.result = None;
         let page = isize::try_from(PAGE_ROWS).unwrap_or(isize::MAX);
         #[expect(
             clippy::wildcard_enum_match_arm,
@@ -203,8 +203,8 @@ impl<'client> Screen<'client> {
         match action {
             KeyAction::Quit => {}
             KeyAction::Stop(robot) => {
-                self.shown.said = Some(format!("stopping {robot} …"));
-                self.asked.push(Box::pin(async move {
+                self.shown.result = Some(format!("stopping {robot} …"));
+                self.requests.push(Box::pin(async move {
                     let words = StopRobot {
                         by: None,
                         reason: Some("from the watch".to_owned()),
@@ -224,7 +224,7 @@ impl<'client> Screen<'client> {
                 }));
             }
             KeyAction::Acknowledge(alert) => {
-                self.asked.push(Box::pin(async move {
+                self.requests.push(Box::pin(async move {
                     match client.acknowledge(alert).await {
                         Ok(alert) => format!("noted as seen: {}", alert.text),
                         Err(error) => format!("not noted: {error}"),

@@ -88,8 +88,9 @@ impl SiteState {
     /// Returns a mission with the newest progress of its robot; missions are only sent on a step.
     fn fresh(&self, mission: &Mission) -> Mission {
         let live = self.robots.get(&mission.robot);
-        let said = live.and_then(|robot| robot.live.as_ref()?.mission);
-        let progress = said.filter(|said| said.id == mission.id && !mission.state.is_terminal());
+        let driven = live.and_then(|robot| robot.live.as_ref()?.mission);
+        let progress =
+            driven.filter(|driven| driven.id == mission.id && !mission.state.is_terminal());
         Mission {
             progress: progress.or(mission.progress),
             ..mission.clone()

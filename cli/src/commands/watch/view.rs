@@ -42,7 +42,7 @@ pub(super) struct View {
     /// Whether the details of the selected robot replace its table.
     pub(super) details: bool,
     /// Result of the last action.
-    pub(super) said: Option<String>,
+    pub(super) result: Option<String>,
     /// Reason why no events arrive; `None` while they do.
     pub(super) lost: Option<String>,
 }

@@ -69,8 +69,8 @@ pub(super) fn check(
         let noise = share * residual.noise_m_s + 0.3 * recent.forward_change;
         if residual.forward_error_m_s.abs() > slack + noise {
             let odometry = means.odometry_m_s.filter(|_| view.channels.odometry);
-            let is_corroborated = odometry.is_some_and(|said| {
-                (said - wheels).abs() <= AXIS.slack(CORROBORATED, said, wheels)
+            let is_corroborated = odometry.is_some_and(|odometry_m_s| {
+                (odometry_m_s - wheels).abs() <= AXIS.slack(CORROBORATED, odometry_m_s, wheels)
             });
             if is_corroborated {
                 // The wheels are right: odometry and fixes are distinguished later.

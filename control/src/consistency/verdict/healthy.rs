@@ -15,7 +15,7 @@ pub(super) fn check(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     let means = &recent.means;
     let (gyro, wheels) = (means.gyro_rad_s, means.wheels);
     let turns = gyro.abs() >= EXCITED && wheels.angular_rad_s.abs() >= EXCITED;
-    let goes = wheels.linear_m_s.abs() >= EXCITED;
+    let drives = wheels.linear_m_s.abs() >= EXCITED;
     let has_fixes = view.residuals().next().is_some();
     // A fault found at standstill is over if the channel agrees at standstill.
     let was_at_rest = |subject: Subject| {
@@ -26,43 +26,43 @@ pub(super) fn check(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     let was_frozen =
         |subject: Subject| active(subject).is_some_and(|found| found.kind == Kind::Frozen);
     let (repeats, channels) = (view.repeats, &view.channels);
-    let gyro_lives = was_frozen(Subject::Gyro) && !repeats.gyro.is_frozen();
-    if channels.gyro && (turns || gyro_lives || was_at_rest(Subject::Gyro)) {
+    let gyro_changes = was_frozen(Subject::Gyro) && !repeats.gyro.is_frozen();
+    if channels.gyro && (turns || gyro_changes || was_at_rest(Subject::Gyro)) {
         verdicts.agree(Subject::Gyro);
     }
     let follows_command = Axis::Forward.follows_command(wheels.linear_m_s, &recent.commanded)
         && Axis::Turn.follows_command(wheels.angular_rad_s, &recent.commanded);
-    let wheels_live = was_frozen(Subject::Wheels) && !repeats.wheels.is_frozen();
+    let wheels_change = was_frozen(Subject::Wheels) && !repeats.wheels.is_frozen();
     if channels.wheels
         && follows_command
-        && (goes || turns || wheels_live || was_at_rest(Subject::Wheels))
+        && (drives || turns || wheels_change || was_at_rest(Subject::Wheels))
     {
         verdicts.agree(Subject::Wheels);
     }
     let position = active(Subject::Position);
     let has_jumped = position.is_some_and(|found| found.kind == Kind::Jumped);
-    let position_lives = was_frozen(Subject::Position) && !repeats.position.is_frozen();
+    let position_changes = was_frozen(Subject::Position) && !repeats.position.is_frozen();
     // Motion of the kind in which the fault was found confirms the position; turning does not
     // confirm the scale.
     let shows_place = |subject: Subject| {
         let is_large = |speed: f64| speed.abs() >= EXCITED_PLACE;
-        let goes = is_large(wheels.linear_m_s);
+        let drives = is_large(wheels.linear_m_s);
         let turns = is_large(gyro) && is_large(wheels.angular_rad_s);
         match view.tracks[subject as usize].found.map(|found| found.unit) {
-            Some(Unit::MetresPerSecond) => goes,
+            Some(Unit::MetresPerSecond) => drives,
             Some(Unit::RadiansPerSecond) => turns,
             Some(Unit::Metres | Unit::Radians | Unit::MetresPerSecondSquared) | None => {
-                goes || turns
+                drives || turns
             }
         }
     };
-    if has_fixes && (shows_place(Subject::Position) || position_lives || has_jumped) {
+    if has_fixes && (shows_place(Subject::Position) || position_changes || has_jumped) {
         verdicts.agree(Subject::Position);
     }
-    let odometry_lives = was_frozen(Subject::Odometry) && !repeats.odometry.is_frozen();
+    let odometry_changes = was_frozen(Subject::Odometry) && !repeats.odometry.is_frozen();
     if channels.odometry
         && means.odometry_m_s.is_some()
-        && (goes || odometry_lives || was_at_rest(Subject::Odometry))
+        && (drives || odometry_changes || was_at_rest(Subject::Odometry))
     {
         verdicts.agree(Subject::Odometry);
     }

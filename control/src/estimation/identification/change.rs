@@ -25,9 +25,9 @@ const SQUARE_MAX: f64 = 25.0;
 /// Limit of what one comparison adds: a jerk in all channels is no change of the ground.
 const GAIN_MAX: f64 = 25.0;
 /// Number of comparisons that are ignored after standstill: one second.
-const STARTS_FOR: u32 = 20;
+const IGNORED_AFTER_STANDSTILL: u32 = 20;
 /// Number of comparisons that are ignored after one side was slow.
-const RESUMES_FOR: u32 = 12;
+const IGNORED_AFTER_SLOW_SIDE: u32 = 12;
 /// Maximum number of comparisons with a slow side after which evidence is kept: two seconds.
 const SLOW_MAX: u32 = 40;
 /// Number of compared channels: all but the body speed.
@@ -89,7 +89,7 @@ impl Default for ChangeMonitor {
     fn default() -> Self {
         Self {
             others: None,
-            ignored: STARTS_FOR,
+            ignored: IGNORED_AFTER_STANDSTILL,
             slow: 0,
             has_torque: false,
             delays_s: [0.0; DELAYED],
@@ -132,7 +132,7 @@ impl ChangeMonitor {
     fn record(&mut self, motion: Motion) -> bool {
         if motion == Motion::Rolling {
             if std::mem::take(&mut self.slow) > 0 {
-                self.ignored = self.ignored.max(RESUMES_FOR);
+                self.ignored = self.ignored.max(IGNORED_AFTER_SLOW_SIDE);
             }
             let is_ignored = self.ignored > 0;
             self.ignored = self.ignored.saturating_sub(1);
@@ -140,7 +140,7 @@ impl ChangeMonitor {
         }
         self.slow = self.slow.saturating_add(1);
         if motion == Motion::Standing || self.slow > SLOW_MAX {
-            self.ignored = STARTS_FOR;
+            self.ignored = IGNORED_AFTER_STANDSTILL;
             for other in self.others.iter_mut().flatten() {
                 other.evidence = 0.0;
             }

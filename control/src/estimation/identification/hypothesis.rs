@@ -312,11 +312,11 @@ impl Hypothesis {
             .for_each(|scale| scale.end_block(&values));
         self.age = self.age.saturating_add(1);
         self.cost *= COST_DECAY;
-        let Some(wanted) = self.solve(prior) else {
+        let Some(solution) = self.solve(prior) else {
             // The same values are used until the equations can be solved.
             return true;
         };
-        let mut step = wanted - self.values;
+        let mut step = solution - self.values;
         let largest = step
             .zip_map(&prior.std_devs, |step, std_dev| step.abs() / std_dev)
             .max();
@@ -442,14 +442,15 @@ impl Hypothesis {
             return None;
         }
         let mut others = ground.information - segment.information + prior.information;
-        let mut wanted = ground.preferred - segment.preferred + prior.information * prior.mean;
+        let mut information_vector =
+            ground.preferred - segment.preferred + prior.information * prior.mean;
         // K of the other blocks is marginalised.
         let of_stiffness: Values = others.column(index::STIFFNESS).into();
         let most = of_stiffness[index::STIFFNESS];
-        wanted -= of_stiffness * (wanted[index::STIFFNESS] / most);
+        information_vector -= of_stiffness * (information_vector[index::STIFFNESS] / most);
         others.ger(-most.recip(), &of_stiffness, &of_stiffness, 1.0);
         let cholesky = (others + segment.information).cholesky()?;
-        let values = cholesky.solve(&(wanted + segment.preferred));
+        let values = cholesky.solve(&(information_vector + segment.preferred));
         let of_stiffness = cholesky.solve(&ln_stiffness_gradient());
         // The segment has too few blocks for a scatter of its own: that of the whole ground is
         // used.

@@ -303,9 +303,9 @@ impl TimeScale {
     pub(super) fn solve(&mut self, prior: &Prior) -> Option<Values> {
         let cholesky = (self.ground.information + prior.information).cholesky()?;
         self.stiffness_covariance = cholesky.solve(&ln_stiffness_gradient());
-        let wanted = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
-        self.ln_stiffness = wanted[index::STIFFNESS];
-        Some(wanted)
+        let solution = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
+        self.ln_stiffness = solution[index::STIFFNESS];
+        Some(solution)
     }
 
     /// Computes the variances of ln K again, from the weights that the blocks have now. They stay

@@ -1,7 +1,7 @@
 //! Reads the demands of stops, leases, limits and the loop's rate once in each tick.
 //!
-//! The view of [`crate::safety`] is copied unless it is being written; otherwise the last copy is
-//! used, whose entries carry their expiry, so that reading late prolongs nothing.
+//! The view of [`crate::safety`] is copied unless it is being written; in that case the copy of an
+//! earlier tick is used. Its entries contain their expiry, so an old copy extends none of them.
 
 use std::time::Duration;
 

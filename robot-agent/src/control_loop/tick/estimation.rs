@@ -316,8 +316,8 @@ impl Estimation {
             left_m_s: 0.0,
             yaw_rate_rad_s: twist.angular_rad_s,
         };
-        let heard = (!is_silent).then_some((velocity, sensed.wheel_speeds));
-        self.slip.step(heard, &self.model, tick.dt_s);
+        let measured = (!is_silent).then_some((velocity, sensed.wheel_speeds));
+        self.slip.step(measured, &self.model, tick.dt_s);
     }
 
     /// Replaces the site definition and returns the former one.

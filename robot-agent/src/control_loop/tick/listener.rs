@@ -28,9 +28,8 @@ pub struct ListenerOutput {
 
 /// Sensing and estimation of the loop, without missions, safety and a base.
 ///
-/// Nobody knows what the wheels of a recorded robot were commanded, so each tick counts them as
-/// commanded what they were last measured to do: no finding says that the wheels do not follow
-/// their commands.
+/// The wheel commands of a recorded robot are unknown. Each tick therefore uses the last measured
+/// wheel speeds as the command, so that no finding reports wheels that do not follow their commands.
 #[derive(Debug)]
 pub struct Listener {
     sensing: Sensing,

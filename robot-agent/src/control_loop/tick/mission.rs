@@ -58,7 +58,7 @@ pub(super) struct MissionInput<'tick> {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct MissionOutput {
     /// Wheel speeds of the mission; `None` without a mission or while the base is silent.
-    pub(super) wanted: Option<WheelSpeeds>,
+    pub(super) wheel_speeds: Option<WheelSpeeds>,
     /// Whether there is a mission.
     pub(super) is_active: bool,
     /// Whether the mission does not command the wheels.
@@ -232,11 +232,11 @@ impl MissionStage {
         self.check_bounds(input);
         self.hold_for_base(now, estimated.fault);
         self.hold_for_sensors(tick.now, input.sensed, events);
-        let wanted = self.follow(input, events);
+        let wheel_speeds = self.follow(input, events);
         let active = self.active.as_ref();
         let beyond_braking = server_silence.saturating_sub(BRAKING_MAX);
         MissionOutput {
-            wanted,
+            wheel_speeds,
             is_active: active.is_some(),
             rests: active.is_none_or(Active::rests),
             is_long_silent: active
@@ -337,7 +337,7 @@ impl MissionStage {
         // The gate would brake anyway; without a command the follower does not wind up. A base that
         // is heard again after a silence stops first.
         let is_heard = estimated.fault.is_none() && self.base_silent_at.is_none();
-        is_heard.then_some(step.wanted)
+        is_heard.then_some(step.wheel_speeds)
     }
 
     fn end(&mut self, now: Moment, reason: EndReason, events: &mut Outgoing) {

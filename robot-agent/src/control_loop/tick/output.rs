@@ -202,7 +202,7 @@ impl Output {
                 view: demands.view,
             },
             outputs: TickOutputs {
-                wanted: gated.wanted,
+                requested: gated.requested,
                 command: gated.output.wheel_speeds,
                 pose: estimated.pose,
                 twist: estimated.twist,

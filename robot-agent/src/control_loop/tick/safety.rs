@@ -36,7 +36,7 @@ pub(super) struct SafetyOutput {
     /// Time by which inputs with an expiry were judged, by the monotonic clock.
     pub(super) judged: Duration,
     /// Wheel speeds of the mission or the teleoperator, before the gate.
-    pub(super) wanted: WheelSpeeds,
+    pub(super) requested: WheelSpeeds,
     /// Output of the gate.
     pub(super) output: GateOutput,
     /// Action of the gate and its counters.
@@ -95,13 +95,13 @@ impl Safety {
 
     /// Chooses mission or teleoperator, and passes the wheel speeds through the gate.
     pub(super) fn step(&mut self, input: &SafetyInput<'_>) -> SafetyOutput {
-        let wanted = self.choose(input);
-        let reasons = self.reasons(input, &wanted);
+        let requested = self.choose(input);
+        let reasons = self.reasons(input, &requested);
         let sensed = input.sensed;
         let output = gate_with(
             &GateInput {
                 // A robot without a mission is commanded to zero, which is not a missing command.
-                command: Some(wanted.wheels),
+                command: Some(requested.wheels),
                 previous: self.command.unwrap_or_default(),
                 stop: input.tick.stop,
                 feedback_age_s: if sensed.is_base_silent {
@@ -118,7 +118,7 @@ impl Safety {
         self.command = Some(output.wheel_speeds);
         SafetyOutput {
             judged: input.judged,
-            wanted: wanted.wheels,
+            requested: requested.wheels,
             output,
             gate: self.gate,
             is_leased: input.demands.is_leased(microseconds(input.judged)),
@@ -143,16 +143,16 @@ impl Safety {
         // A mission that is still braking for the lease stops first.
         if !(teleoperation.is_leased(judged_us) && input.followed.rests) {
             return RequestedSpeeds {
-                wheels: input.followed.wanted.unwrap_or_default(),
+                wheels: input.followed.wheel_speeds.unwrap_or_default(),
                 is_teleoperated: false,
                 is_driver_silent: false,
             };
         }
-        let wanted = teleoperation.wanted_at(judged_us);
+        let requested = teleoperation.wanted_at(judged_us);
         let command = self.command.unwrap_or_default();
         let mut change = Change {
             from: self.model.twist_from_wheel_speeds(command),
-            to: wanted.unwrap_or_default(),
+            to: requested.unwrap_or_default(),
         };
         let ends_soon = teleoperation.ends_soon(judged_us);
         if ends_soon {
@@ -165,12 +165,12 @@ impl Safety {
         RequestedSpeeds {
             wheels: self.model.wheel_speeds_from_twist(twist),
             is_teleoperated: true,
-            is_driver_silent: wanted.is_none(),
+            is_driver_silent: requested.is_none(),
         }
     }
 
     /// Returns the largest speed allowed by the fence, m/s; `None` without a fence or a pose.
-    fn fence_max_m_s(&self, estimated: &EstimationOutput<'_>, wanted: Twist) -> Option<f64> {
+    fn fence_max_m_s(&self, estimated: &EstimationOutput<'_>, requested: Twist) -> Option<f64> {
         let site = estimated.site.filter(|site| !site.fence().is_empty())?;
         let pose = estimated.pose?;
         let seen = estimated.estimate.mu_peak_lower_bound;
@@ -184,7 +184,7 @@ impl Safety {
             pose,
             position_std_dev_m: estimated.position_std_dev_m,
             present: estimated.twist,
-            wanted,
+            requested,
             mu_lower,
         };
         site.fence().limit_speed(&input, &self.model).speed_max_m_s
@@ -198,7 +198,7 @@ impl Safety {
     fn position_restriction(
         &self,
         input: &SafetyInput<'_>,
-        wanted: &RequestedSpeeds,
+        requested: &RequestedSpeeds,
     ) -> (bool, Option<f64>) {
         let estimated = input.estimated;
         let is_lost = estimated.fault == Some(Fault::PositionLost)
@@ -208,29 +208,32 @@ impl Safety {
             return (false, None);
         }
         let is_fenced = estimated.site.is_some_and(|site| !site.fence().is_empty());
-        let must_stand = if wanted.is_teleoperated {
+        let must_stand = if requested.is_teleoperated {
             is_fenced && !self.blind_within_fence
         } else {
             is_fenced || input.followed.is_active
         };
-        (must_stand, wanted.is_teleoperated.then_some(BLIND_MAX_M_S))
+        (
+            must_stand,
+            requested.is_teleoperated.then_some(BLIND_MAX_M_S),
+        )
     }
 
-    fn reasons(&self, input: &SafetyInput<'_>, wanted: &RequestedSpeeds) -> Reasons {
+    fn reasons(&self, input: &SafetyInput<'_>, requested: &RequestedSpeeds) -> Reasons {
         let demands = input.demands;
         let limits = &demands.view.limits;
         let judged_us = microseconds(input.judged);
         let rest = WheelSpeeds::default();
-        let is_moving = wanted.wheels != rest || self.command.unwrap_or_default() != rest;
-        let twist = self.model.twist_from_wheel_speeds(wanted.wheels);
+        let is_moving = requested.wheels != rest || self.command.unwrap_or_default() != rest;
+        let twist = self.model.twist_from_wheel_speeds(requested.wheels);
         let fence_max_m_s = if is_moving {
             self.fence_max_m_s(input.estimated, twist)
         } else {
             None
         };
-        let is_driving = is_moving || input.followed.is_active || wanted.is_teleoperated;
+        let is_driving = is_moving || input.followed.is_active || requested.is_teleoperated;
         let (is_position_lost, blind_max_m_s) = if is_driving {
-            self.position_restriction(input, wanted)
+            self.position_restriction(input, requested)
         } else {
             (false, None)
         };
@@ -241,13 +244,13 @@ impl Safety {
             tilt_rad: input.sensed.tilt_rad,
             is_position_lost,
             is_loop_late: demands.overrun.is_some(),
-            is_sensor_wrong: input.sensed.must_hold() && !wanted.is_teleoperated,
+            is_sensor_wrong: input.sensed.must_hold() && !requested.is_teleoperated,
             is_held_outside: limits.holds(judged_us),
             is_link_silent: input.followed.is_long_silent,
-            is_driver_silent: wanted.is_driver_silent,
+            is_driver_silent: requested.is_driver_silent,
             fence_max_m_s,
             outside_max_m_s: limits.linear_max_m_s(judged_us),
-            command_age_max_m_s: (wanted.is_teleoperated && share < 1.0)
+            command_age_max_m_s: (requested.is_teleoperated && share < 1.0)
                 .then_some(share * linear_max_m_s),
             blind_max_m_s,
             sensors_max_m_s: input.sensed.sensors_max_m_s(),

@@ -102,10 +102,10 @@ impl Sensing {
         if let Some(commanded) = input.commanded {
             self.monitor.command(commanded);
         }
-        let heard = input.feedback.samples();
+        let received = input.feedback.samples();
         let mut samples = [CheckedSample::default(); SAMPLES_MAX];
         let (mut turn_rad_s, mut fix) = (None, None);
-        for (checked, sample) in samples.iter_mut().zip(heard) {
+        for (checked, sample) in samples.iter_mut().zip(received) {
             *checked = self.check(sample);
             turn_rad_s = sample.yaw_rate_rad_s.or(turn_rad_s);
             if let Some(pose) = sample.position.filter(|pose| pose.is_finite()) {
@@ -114,7 +114,7 @@ impl Sensing {
         }
         SensingOutput {
             samples,
-            count: heard.len(),
+            count: received.len(),
             lost_samples: input.feedback.lost(),
             findings: self.findings,
             is_base_silent: input.is_base_silent,

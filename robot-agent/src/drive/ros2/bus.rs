@@ -305,7 +305,7 @@ impl Bus {
     ) -> Result<(), LinkError> {
         let receiver = Arc::clone(receiver);
         session
-            .declare_subscriber(self.key_to_hear(topic))
+            .declare_subscriber(self.subscription_key(topic))
             .callback(move |sample| {
                 deliver(&sample, |key, with, said| receiver.take(key, with, said));
             })
@@ -314,7 +314,7 @@ impl Bus {
             .map_err(zenoh_failed("listen to a topic"))
     }
 
-    fn key_to_hear(&self, topic: &Name) -> String {
+    fn subscription_key(&self, topic: &Name) -> String {
         let bus = &self.settings.bus;
         match self.generation() {
             Some(_) => rmw::any_type_key(bus.domain, topic),
@@ -326,7 +326,7 @@ impl Bus {
     fn watch_commands(&self, session: &zenoh::Session) -> Result<(), LinkError> {
         let watch = Arc::clone(&self.command_watch);
         session
-            .declare_subscriber(self.key_to_hear(&self.settings.command.topic))
+            .declare_subscriber(self.subscription_key(&self.settings.command.topic))
             .callback(move |sample| {
                 deliver(&sample, |key, with, said| watch.receive(key, with, said));
             })

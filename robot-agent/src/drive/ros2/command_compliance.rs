@@ -2,14 +2,14 @@
 //! switched off, another node that commands the base too.
 //!
 //! A wheel's speed must lie between the smallest and the largest command of the last [`MEMORY`],
-//! widened by a tolerance, so that a lag within that time is accepted. Slip does not matter: it
-//! moves the robot against its wheels, not the wheels against their command. Nothing is judged
-//! while only zero was commanded, since the robot may be moved by others then.
+//! widened by a tolerance, so that a lag within that time is accepted. Slip has no effect on the
+//! check: it changes the motion of the robot, not that of the wheels. Wheels are not checked while
+//! only zero was commanded, because somebody may push the robot then.
 //!
-//! Two nodes that command one base alternate, so its wheels follow the agent's commands part of the
-//! time. The time for which they do not is therefore summed up, and reduced by [`PARDON`] of the
-//! time for which they do. Wheels with stuck encoders or a drive that is off stand still without
-//! interruption, which is measured by the time since they last did otherwise.
+//! The commands of two nodes for one base alternate, so its wheels follow those of the agent part of
+//! the time. The time of non-compliance is therefore summed, less [`COMPLIANCE_CREDIT`] of the time of
+//! compliance. Wheels with stuck encoders, or with a drive that is off, stand still without
+//! interruption; the duration of this standstill is measured separately.
 
 use std::time::Duration;
 
@@ -20,19 +20,19 @@ const MEMORY: Duration = Duration::from_millis(600);
 /// Number of spans into which [`MEMORY`] is divided.
 const SPANS: usize = 12;
 /// Summed time without compliance after which the wheels are refused.
-const FOR: Duration = Duration::from_millis(500);
+const NONCOMPLIANCE_MAX: Duration = Duration::from_millis(500);
 /// Fraction of the time of compliance that is subtracted: the wheels may disobey a third of the
 /// time.
-const PARDON: f64 = 0.5;
+const COMPLIANCE_CREDIT: f64 = 0.5;
 /// Longest time that one sample of the wheels accounts for.
-const WORD_MAX: Duration = Duration::from_millis(100);
+const SAMPLE_SPAN_MAX: Duration = Duration::from_millis(100);
 /// Time for which wheels must stand still without interruption to count as stuck; longer than the
 /// interruptions by another node that halts the drive now and then.
-const STANDS_FOR: Duration = Duration::from_millis(350);
+const STANDSTILL_MIN: Duration = Duration::from_millis(350);
 /// Ratio to its command below which a wheel's speed counts as standstill.
 const STANDING_SHARE: f64 = 0.1;
 /// Time of compliance after which the wheels are accepted again.
-const AGAIN_FOR: Duration = Duration::from_secs(1);
+const RECOVERY_TIME: Duration = Duration::from_secs(1);
 /// Tolerance of a wheel's speed: absolute, rad/s, and relative to the command.
 const TOLERANCE: (f64, f64) = (1.0, 0.25);
 
@@ -186,7 +186,7 @@ impl CommandCompliance {
         let all = spans.fold(Envelope::NONE, Envelope::with);
         let obeys = all.is_rest() || all.holds(measured);
         let judged_at = self.judged_at.replace(now).unwrap_or(now);
-        let span = now.saturating_sub(judged_at).min(WORD_MAX);
+        let span = now.saturating_sub(judged_at).min(SAMPLE_SPAN_MAX);
         let stands = !obeys && all.is_standing(measured);
         self.stood = if stands {
             self.stood + span
@@ -194,21 +194,23 @@ impl CommandCompliance {
             Duration::ZERO
         };
         if self.verdict != Verdict::Obeys {
-            if self.stood >= STANDS_FOR {
+            if self.stood >= STANDSTILL_MIN {
                 self.verdict = Verdict::Stands;
             }
             let since = obeys.then(|| self.obeys_since.unwrap_or(now));
             self.obeys_since = since;
-            if since.is_some_and(|since| now.saturating_sub(since) >= AGAIN_FOR) {
+            if since.is_some_and(|since| now.saturating_sub(since) >= RECOVERY_TIME) {
                 self.verdict = Verdict::Obeys;
                 (self.disobeyed, self.obeys_since) = (Duration::ZERO, None);
             }
         } else if obeys {
-            self.disobeyed = self.disobeyed.saturating_sub(span.mul_f64(PARDON));
+            self.disobeyed = self
+                .disobeyed
+                .saturating_sub(span.mul_f64(COMPLIANCE_CREDIT));
         } else {
             self.disobeyed += span;
-            if self.disobeyed >= FOR {
-                self.verdict = if self.stood >= STANDS_FOR {
+            if self.disobeyed >= NONCOMPLIANCE_MAX {
+                self.verdict = if self.stood >= STANDSTILL_MIN {
                     Verdict::Stands
                 } else {
                     Verdict::MovesOtherwise
@@ -295,7 +297,7 @@ mod tests {
     fn stuck_encoders_and_swapped_sides_are_seen() {
         let forward = |_| speeds(8.0, 8.0);
         let (stuck, verdict) = run(500, forward, |_| speeds(0.0, 0.0)).unwrap();
-        assert!(stuck <= FOR + 2 * STEP, "{stuck:?}");
+        assert!(stuck <= NONCOMPLIANCE_MAX + 2 * STEP, "{stuck:?}");
         assert_eq!(verdict, Verdict::Stands);
         // A drive that is switched off coasts for a moment.
         let coasting = |at_s: f64| {
@@ -305,7 +307,7 @@ mod tests {
         let (_, verdict) = run(500, forward, coasting).unwrap();
         assert_eq!(verdict, Verdict::Stands);
         let (swapped, verdict) = run(500, |_| speeds(2.0, 8.0), |_| speeds(8.0, 2.0)).unwrap();
-        assert!(swapped <= FOR + 2 * STEP, "{swapped:?}");
+        assert!(swapped <= NONCOMPLIANCE_MAX + 2 * STEP, "{swapped:?}");
         assert_eq!(verdict, Verdict::MovesOtherwise);
     }
 

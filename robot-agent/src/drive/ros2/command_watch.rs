@@ -31,7 +31,7 @@ const CONTEST_SPAN: Duration = Duration::from_millis(500);
 /// Detects whether another node commands the base while the agent drives it. Pure.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct ForeignCommandWatch {
-    heard: u64,
+    last_count: u64,
     /// Times of the newest foreign commands, oldest first.
     newest: [Option<Duration>; CONTEST_MIN],
     is_contested: bool,
@@ -41,8 +41,8 @@ impl ForeignCommandWatch {
     /// Updates the state with the total number of foreign commands and whether the agent drives;
     /// returns whether the base is contested.
     pub(super) fn check(&mut self, now: Duration, foreign_commands: u64, drives: bool) -> bool {
-        let new = foreign_commands.saturating_sub(self.heard);
-        self.heard = foreign_commands;
+        let new = foreign_commands.saturating_sub(self.last_count);
+        self.last_count = foreign_commands;
         for _ in 0..new.min(CONTEST_MIN as u64) {
             self.newest.rotate_left(1);
             self.newest[CONTEST_MIN - 1] = Some(now);

@@ -50,6 +50,6 @@ impl PublishedTopic {
 
 /// Publishes the agent's state. Runs on a thread of its own.
 pub(crate) trait StatePublisher: std::fmt::Debug + Send + Sync {
-    /// Calls `say` with each message that is due, encoded.
-    fn step(&mut self, now: Duration, wall_ns: i64, say: &mut dyn FnMut(PublishedTopic, &[u8]));
+    /// Calls `publish` with each message that is due, encoded.
+    fn step(&mut self, now: Duration, wall_ns: i64, publish: &mut dyn FnMut(PublishedTopic, &[u8]));
 }

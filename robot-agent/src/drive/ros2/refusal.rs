@@ -230,8 +230,8 @@ impl Counts {
         self.received[source as usize].fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Returns a description of those of these topics that are configured and on which no message
-    /// has come since the start, for people; `None` if there is none.
+    /// Returns a text that names the configured topics of `sources` without any message since the
+    /// start; `None` if every one has had a message.
     pub fn topics_without_messages(&self, sources: &[Source]) -> Option<String> {
         let is_missing = |source: &Source| {
             let received = &self.received[*source as usize];

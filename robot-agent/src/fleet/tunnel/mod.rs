@@ -47,9 +47,9 @@ const CONNECTIONS_MAX: usize = 16;
 /// Largest number of simultaneous local connections that have not sent the session id; the oldest
 /// is closed. They are counted apart, so that other programs cannot use up the session's
 /// connections.
-const STRANGERS_MAX: usize = 16;
+const UNKNOWN_CLIENTS_MAX: usize = 16;
 /// Interval of the log lines that count other programs at the local port.
-const STRANGERS_LOG_EVERY: Duration = Duration::from_mins(1);
+const UNKNOWN_CLIENTS_LOG_EVERY: Duration = Duration::from_mins(1);
 /// Connections that the kernel queues until they are accepted.
 const BACKLOG: u32 = 16;
 /// Receive buffer of the local port, and buffer of the tunnel per direction, bytes; data in them
@@ -84,7 +84,7 @@ struct Shared {
     ready: Mutex<Option<Connection>>,
     /// Permits for the session's connections.
     places: Semaphore,
-    strangers: UnknownClientLog,
+    unknown_clients: UnknownClientLog,
     stale: CancellationToken,
 }
 
@@ -105,7 +105,7 @@ impl UnknownClientLog {
         counted.count += 1;
         let is_due = counted
             .logged_at
-            .is_none_or(|logged_at| now.duration_since(logged_at) >= STRANGERS_LOG_EVERY);
+            .is_none_or(|logged_at| now.duration_since(logged_at) >= UNKNOWN_CLIENTS_LOG_EVERY);
         if !is_due {
             return None;
         }
@@ -214,7 +214,7 @@ impl Tunnel {
             session_id: number.to_le_bytes(),
             ready: Mutex::new(Some(connection)),
             places: Semaphore::new(CONNECTIONS_MAX),
-            strangers: UnknownClientLog::default(),
+            unknown_clients: UnknownClientLog::default(),
             stale: stale.clone(),
         });
         let mut tasks = JoinSet::new();
@@ -269,23 +269,23 @@ async fn serve(listener: TcpListener, shared: Arc<Shared>) {
     let _stale = shared.stale.clone().drop_guard();
     let mut connections = JoinSet::new();
     // Connections that have not sent the session id, oldest first.
-    let mut strangers: VecDeque<CancellationToken> = VecDeque::new();
+    let mut unknown_clients: VecDeque<CancellationToken> = VecDeque::new();
     while !shared.stale.is_cancelled() {
         let accepted = tokio::select! {
             accepted = listener.accept() => accepted,
             () = shared.stale.cancelled() => return,
         };
         while connections.try_join_next().is_some() {}
-        strangers.retain(|known| !known.is_cancelled());
+        unknown_clients.retain(|known| !known.is_cancelled());
         match accepted {
             Ok((local, _peer)) => {
-                if strangers.len() >= STRANGERS_MAX
-                    && let Some(oldest) = strangers.pop_front()
+                if unknown_clients.len() >= UNKNOWN_CLIENTS_MAX
+                    && let Some(oldest) = unknown_clients.pop_front()
                 {
                     oldest.cancel();
                 }
                 let known = CancellationToken::new();
-                strangers.push_back(known.clone());
+                unknown_clients.push_back(known.clone());
                 connections.spawn(take(local, Arc::clone(&shared), known));
             }
             Err(cause) => {
@@ -306,13 +306,13 @@ async fn take(mut local: TcpStream, shared: Arc<Shared>, known: CancellationToke
     let reading = tokio::time::timeout(FIRST_MESSAGE_TIMEOUT, read_message(&mut local));
     let read = tokio::select! {
         read = reading => read,
-        () = known.cancelled() => return shared.strangers.record(),
+        () = known.cancelled() => return shared.unknown_clients.record(),
     };
     known.cancel();
     let has_id = |bytes: &[u8]| *bytes == shared.session_id;
     let first = match read {
         Ok(Ok(first)) if first.windows(shared.session_id.len()).any(has_id) => first,
-        Ok(_) | Err(_) => return shared.strangers.record(),
+        Ok(_) | Err(_) => return shared.unknown_clients.record(),
     };
     let Ok(_place) = shared.places.try_acquire() else {
         return warn!("the session has too many connections");

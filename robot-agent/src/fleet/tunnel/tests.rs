@@ -199,9 +199,15 @@ fn other_programs_are_logged_now_and_then_with_their_count() {
     let begun = tokio::time::Instant::now();
     assert_eq!(log.count_client(begun), Some(1));
     for _ in 0..1_000 {
-        assert_eq!(log.count_client(begun + STRANGERS_LOG_EVERY / 2), None);
+        assert_eq!(
+            log.count_client(begun + UNKNOWN_CLIENTS_LOG_EVERY / 2),
+            None
+        );
     }
-    assert_eq!(log.count_client(begun + STRANGERS_LOG_EVERY), Some(1_001));
+    assert_eq!(
+        log.count_client(begun + UNKNOWN_CLIENTS_LOG_EVERY),
+        Some(1_001)
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

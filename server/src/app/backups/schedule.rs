@@ -1,5 +1,4 @@
-//! Backups that the server makes by itself: when they are due, how many are kept, and what is shown
-//! of them.
+//! Scheduled backups: when they are due, how many are kept, and their reported state.
 
 use std::fs::DirBuilder;
 use std::os::unix::fs::DirBuilderExt as _;
@@ -23,7 +22,7 @@ pub const BACKUP_FAILED_ALERT: &str = "backup-failed";
 /// Code of the alert about a last backup that is too old.
 pub const BACKUP_OLD_ALERT: &str = "backup-old";
 /// Interval at which the server checks whether a backup is due.
-const LOOK_EVERY: Duration = Duration::from_secs(1);
+const CHECK_EVERY: Duration = Duration::from_secs(1);
 /// Interval at which the folder is read again: people may remove or add backups.
 const LIST_EVERY: Duration = Duration::from_mins(1);
 /// Time after a failure before the next attempt.
@@ -84,7 +83,7 @@ pub async fn run(app: App, schedule: Option<Schedule>, stop: CancellationToken) 
         }
         tokio::select! {
             () = stop.cancelled() => {}
-            () = tokio::time::sleep(LOOK_EVERY) => {}
+            () = tokio::time::sleep(CHECK_EVERY) => {}
         }
     }
 }

@@ -54,12 +54,12 @@ pub(in crate::app) fn control_model(
 }
 
 /// Converts a trajectory to the planner's type.
-pub(super) fn control_trajectory(asked: &Trajectory) -> planned::Trajectory {
+pub(super) fn control_trajectory(requested: &Trajectory) -> planned::Trajectory {
     let control_point = |point: Point| control::Point {
         x_m: point.x_m,
         y_m: point.y_m,
     };
-    match asked {
+    match requested {
         Trajectory::Circle(circle) => planned::Trajectory::Circle(planned::CircleSpec {
             center: control_point(circle.center),
             radius_m: circle.radius_m,
@@ -85,8 +85,8 @@ pub(super) fn control_trajectory(asked: &Trajectory) -> planned::Trajectory {
 }
 
 /// Converts the limits that the request gives beside the trajectory to the planner's options.
-pub(super) fn plan_options(asked: &Trajectory) -> PlanOptions<'static> {
-    let options = asked.options();
+pub(super) fn plan_options(requested: &Trajectory) -> PlanOptions<'static> {
+    let options = requested.options();
     PlanOptions {
         approach_speed_m_s: options.approach_speed_m_s,
         excitation: options.excitation.map(|excitation| ExcitationSpec {

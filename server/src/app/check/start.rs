@@ -129,11 +129,11 @@ pub(super) fn after(
 ) -> Start {
     earlier.iter().fold(first, |start, (mission, traction)| {
         let from = mission.begin.unwrap_or(start.pose);
-        let asked = Planning {
+        let planning = Planning {
             trajectory: &mission.trajectory,
             traction,
         };
-        let Ok(planned) = planned(model, asked, from) else {
+        let Ok(planned) = planned(model, planning, from) else {
             return start;
         };
         let plan = &planned.plan;

@@ -105,11 +105,11 @@ impl App {
             return Err(EnrolError::Expired(token.id));
         }
         let robot = match (&token.robot, robot) {
-            (Some(named), Some(asked)) if named != asked => {
+            (Some(named), Some(requested)) if named != requested => {
                 return Err(EnrolError::OtherRobot(token.id));
             }
             (Some(named), _) => named.clone(),
-            (None, Some(asked)) => asked.clone(),
+            (None, Some(requested)) => requested.clone(),
             (None, None) => return Err(EnrolError::Nameless(token.id)),
         };
         let former = db::enrolments::newest(&mut tx, &token.site, &robot).await?;

@@ -79,7 +79,7 @@ impl EnrolmentRegistry {
     }
 
     /// Returns whether messages of a robot are accepted, over any link.
-    pub fn may_speak(&self, key: &RobotKey) -> bool {
+    pub fn may_send(&self, key: &RobotKey) -> bool {
         match self.status(key) {
             Some(EnrolmentStatus::Enrolled(_)) => true,
             Some(EnrolmentStatus::Revoked(_)) => false,
@@ -140,7 +140,7 @@ mod tests {
                     registry.record(&enrolment(number, is_revoked));
                 }
                 assert_eq!(registry.status(&key), Some(EnrolmentStatus::Revoked(2)));
-                assert!(!registry.may_speak(&key));
+                assert!(!registry.may_send(&key));
             }
         }
     }
@@ -149,14 +149,14 @@ mod tests {
     fn a_stranger_may_speak_until_the_registry_is_closed() {
         let registry = EnrolmentRegistry::default();
         let key: RobotKey = ("yard".parse().unwrap(), "rover-1".parse().unwrap());
-        assert!(registry.may_speak(&key) && !registry.is_in_force(&key, 1));
+        assert!(registry.may_send(&key) && !registry.is_in_force(&key, 1));
         registry.close();
-        assert!(!registry.may_speak(&key));
+        assert!(!registry.may_send(&key));
         let changes = registry.changes();
         registry.record(&enrolment(1, false));
         assert!(changes.has_changed().unwrap());
         assert!(
-            registry.may_speak(&key)
+            registry.may_send(&key)
                 && registry.is_in_force(&key, 1)
                 && !registry.is_in_force(&key, 2)
         );

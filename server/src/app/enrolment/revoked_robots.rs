@@ -50,7 +50,7 @@ impl App {
     /// Returns whether a robot's messages are accepted. If not, counts the refusal, and raises an
     /// alert for a revoked robot.
     pub fn admits(&self, key: &RobotKey) -> bool {
-        if self.enrolment_registry().may_speak(key) {
+        if self.enrolment_registry().may_send(key) {
             return true;
         }
         match self.enrolment_registry().status(key) {

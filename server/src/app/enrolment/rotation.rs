@@ -223,9 +223,9 @@ impl App {
                     () = stop.cancelled() => return,
                     () = tokio::time::sleep(SETTLE_EVERY) => {}
                 }
-                let asked = Arc::clone(&authorities);
-                let settling = tokio::task::spawn_blocking(move || asked.retry_sync());
-                match settling.await {
+                let retried = Arc::clone(&authorities);
+                let syncing = tokio::task::spawn_blocking(move || retried.retry_sync());
+                match syncing.await {
                     Ok(Ok(())) => {
                         info!("the disk has confirmed that the former authority is retired");
                     }

@@ -120,7 +120,7 @@ impl Feed {
             .rows_of
             .1
             .is_none_or(|read_at| now.saturating_sub(read_at) >= ROWS_PERIOD);
-        let mut news: HashSet<RobotKey> = HashSet::new();
+        let mut changed: HashSet<RobotKey> = HashSet::new();
         let mut failed = None;
         if due && self.rows_of.0 != generation {
             let rows = match self.read_rows().await {
@@ -135,7 +135,7 @@ impl Feed {
                     (&before.name, before.retired_at, raised) == (&row.name, row.retired_at, alerts)
                 };
                 if !self.rows.get(key).is_some_and(is_same) {
-                    news.insert(key.clone());
+                    changed.insert(key.clone());
                 }
             }
             self.rows = rows;
@@ -147,11 +147,11 @@ impl Feed {
             };
             self.rows_of = (read, Some(now));
         }
-        news.extend(self.app.presences().take_changed(now));
+        changed.extend(self.app.presences().take_changed(now));
         if self.app.hub().client_count() == 0 {
             return failed.map_or(Ok(()), Err);
         }
-        for key in news {
+        for key in changed {
             if let Some((row, alerts)) = self.rows.get(&key) {
                 let robot: Robot = self.app.with_live(row.clone(), alerts.clone());
                 let event = Event::Robot(Box::new(robot));

@@ -28,7 +28,7 @@ pub const KEPT_BYTES_MAX: usize = 16 * 1024 * 1024;
 /// Maximum length of the name of a run.
 const RUN_LENGTH_MAX: usize = 16;
 /// How long a client that was dropped may take to read its end.
-const LINGER: Duration = Duration::from_secs(5);
+const CLOSE_WAIT_MAX: Duration = Duration::from_secs(5);
 
 /// Returns the identifier of an event of a run.
 pub(super) fn id_of(run: &str, Position { seq, step }: Position) -> String {
@@ -220,8 +220,8 @@ impl Hub {
         }
         let mut slow = Vec::new();
         for (&id, client) in &state.clients {
-            let wanted = client.filter.matches(sent.topic, sent.about.as_ref());
-            if wanted && !client.take(&sent) {
+            let is_wanted = client.filter.matches(sent.topic, sent.about.as_ref());
+            if is_wanted && !client.take(&sent) {
                 slow.push(id);
             }
         }
@@ -254,7 +254,7 @@ impl Hub {
         state.drop_slow(late);
         state.dropped.retain_mut(|(since, cut)| {
             let since = *since.get_or_insert(now);
-            let over = now.saturating_sub(since) > LINGER;
+            let over = now.saturating_sub(since) > CLOSE_WAIT_MAX;
             if over {
                 cut.cancel();
             }

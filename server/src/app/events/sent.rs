@@ -48,9 +48,9 @@ pub struct EventFilter {
 
 impl EventFilter {
     pub(super) fn matches(&self, topic: Option<Topic>, about: Option<&EventSubject>) -> bool {
-        let of_topic = topic.is_none_or(|topic| self.wants(topic));
+        let of_topic = topic.is_none_or(|topic| self.includes_topic(topic));
         let is_about = |about: &EventSubject| match about {
-            (site, Some(robot)) => self.wants_robot(site, robot),
+            (site, Some(robot)) => self.includes_robot(site, robot),
             // A filter on robots does not exclude events about a whole site.
             (site, None) => {
                 self.site.as_ref().is_none_or(|wanted| wanted == site)
@@ -60,11 +60,11 @@ impl EventFilter {
         of_topic && about.is_none_or(is_about)
     }
 
-    pub(super) fn wants(&self, topic: Topic) -> bool {
+    pub(super) fn includes_topic(&self, topic: Topic) -> bool {
         self.topics.is_empty() || self.topics.contains(&topic)
     }
 
-    pub(super) fn wants_robot(&self, site: &SiteId, robot: &RobotId) -> bool {
+    pub(super) fn includes_robot(&self, site: &SiteId, robot: &RobotId) -> bool {
         self.site.as_ref().is_none_or(|wanted| wanted == site)
             && (self.robots.is_empty() || self.robots.contains(robot))
             && self.within.includes_robot(site, robot)

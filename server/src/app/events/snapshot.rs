@@ -81,7 +81,8 @@ struct Scope {
 struct Built {
     scope: Scope,
     at: Duration,
-    /// Gathering of clients: nothing is published while there is no client.
+    /// Value of the hub's counter of first clients. If it differs, there was a time without clients,
+    /// in which no events were published.
     gathering: u64,
     snapshot: Weak<Snapshot>,
 }
@@ -161,7 +162,7 @@ impl App {
         };
         let mut tx = self.db().read("events").await?;
         let alerts = db::alerts::raised(&mut tx, ALERTS_MAX).await?;
-        if filter.wants(Topic::Robots) {
+        if filter.includes_topic(Topic::Robots) {
             let mut of_robots: HashMap<RobotKey, Vec<Alert>> = HashMap::new();
             for alert in &alerts {
                 if let Some(key) = alert.robot_key() {
@@ -169,7 +170,7 @@ impl App {
                 }
             }
             for row in db::robots::all(&mut tx, FLEET_ROBOTS_MAX).await? {
-                if row.retired_at.is_none() && filter.wants_robot(&row.site, &row.id) {
+                if row.retired_at.is_none() && filter.includes_robot(&row.site, &row.id) {
                     let key = (row.site.clone(), row.id.clone());
                     let alerts = of_robots.remove(&key).unwrap_or_default();
                     let robot = Event::Robot(Box::new(self.with_live(row, alerts)));
@@ -177,7 +178,7 @@ impl App {
                 }
             }
         }
-        if filter.wants(Topic::Missions) {
+        if filter.includes_topic(Topic::Missions) {
             for mission in self.missions_to_show(&mut tx, &filter).await? {
                 let key = (mission.site.clone(), mission.robot.clone());
                 add(
@@ -187,14 +188,14 @@ impl App {
                 );
             }
         }
-        if filter.wants(Topic::Alerts) {
+        if filter.includes_topic(Topic::Alerts) {
             let of_server = self.storage().alerts(&AlertFilter {
                 raised: true,
                 ..AlertFilter::default()
             });
             for alert in alerts.into_iter().chain(of_server) {
                 let key = alert.robot_key();
-                let is_wanted = |(site, robot): &RobotKey| filter.wants_robot(site, robot);
+                let is_wanted = |(site, robot): &RobotKey| filter.includes_robot(site, robot);
                 if key.as_ref().is_none_or(is_wanted) {
                     add(&Event::Alert(Box::new(alert)), Topic::Alerts, key);
                 }
@@ -234,7 +235,8 @@ impl App {
             }
         }
         let missions = rows.into_iter().map(|row| self.with_progress(row.mission));
-        let wanted = missions.filter(|mission| filter.wants_robot(&mission.site, &mission.robot));
+        let wanted =
+            missions.filter(|mission| filter.includes_robot(&mission.site, &mission.robot));
         let mut missions: Vec<Mission> = wanted.collect();
         missions.sort_by_key(|mission| mission.id);
         Ok(missions)

@@ -20,7 +20,7 @@ use crate::friction::epochs::HOUR_S;
 use crate::friction::index::{Block, Cells, Contribution, SiteMap};
 
 /// Maximum number of cells that one request for visits may cover.
-const LOOKED_AT_MAX: f64 = 262_144.0;
+const VISIT_CELLS_MAX: f64 = 262_144.0;
 /// Relative standard deviation of θ (σ/θ) of one ordinary visit by one robot, including the robot's
 /// own bias.
 const VISIT_DEVIATION_RATIO: f64 = 0.13;
@@ -34,19 +34,19 @@ impl App {
     pub async fn visits_worth_most(
         &self,
         site: &SiteId,
-        asked: &ReadingParameters,
+        parameters: &ReadingParameters,
         area: Area,
         limit: u32,
     ) -> Result<MapPage<VisitSuggestion>, AppError> {
-        let reading = Reading::new(self, asked)?;
+        let reading = Reading::new(self, parameters)?;
         let view = self.site_view(site).await?;
         let row = view.row.clone();
         let grid = view.row.site.grid;
         let count = area.count(grid.cell_m);
-        if count > LOOKED_AT_MAX {
+        if count > VISIT_CELLS_MAX {
             return Err(AppError::InvalidQuery {
                 parameter: "x_min_m",
-                detail: format!("this box has {count} cells; at most {LOOKED_AT_MAX} here"),
+                detail: format!("this box has {count} cells; at most {VISIT_CELLS_MAX} here"),
             });
         }
         let CellBox { min, max } = area.cells(&grid)?;

@@ -26,7 +26,7 @@ const CELLS_AT_ONCE: usize = 4_096;
 
 /// The cells that a request asks for.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CellsAsked<'query> {
+pub struct CellRequest<'query> {
     /// Where.
     pub area: Area,
     /// Side of the squares into which cells are joined, metres; `None` for the grid's own cells.
@@ -43,16 +43,16 @@ impl App {
     pub async fn friction_of_cells(
         &self,
         site: &SiteId,
-        asked: &ReadingParameters,
-        cells: CellsAsked<'_>,
+        parameters: &ReadingParameters,
+        cells: CellRequest<'_>,
     ) -> Result<MapPage<CellFriction>, AppError> {
-        let CellsAsked {
+        let CellRequest {
             area,
             resolution_m,
             cursor,
             limit,
         } = cells;
-        let reading = Reading::new(self, asked)?;
+        let reading = Reading::new(self, parameters)?;
         let after = cursor.map(read_cursor).transpose()?;
         let row = self.site_view(site).await?.row.clone();
         let grid = row.site.grid;
@@ -111,10 +111,10 @@ impl App {
     pub async fn friction_at(
         &self,
         site: &SiteId,
-        asked: &ReadingParameters,
+        parameters: &ReadingParameters,
         point: Point,
     ) -> Result<PointFriction, AppError> {
-        let reading = Reading::new(self, asked)?;
+        let reading = Reading::new(self, parameters)?;
         let view = self.site_view(site).await?;
         let cell = view.cell_at(point)?;
         let row = view.row.clone();
@@ -129,15 +129,15 @@ impl App {
     pub async fn friction_difference(
         &self,
         site: &SiteId,
-        asked: &ReadingParameters,
+        parameters: &ReadingParameters,
         (from, to): (Timestamp, Option<Timestamp>),
-        cells: CellsAsked<'_>,
+        cells: CellRequest<'_>,
     ) -> Result<DifferencePage<CellDifference>, AppError> {
-        let asked = ReadingParameters {
+        let parameters = ReadingParameters {
             as_of: to,
-            ..asked.clone()
+            ..parameters.clone()
         };
-        let late = Reading::new(self, &asked)?;
+        let late = Reading::new(self, &parameters)?;
         if from.as_microsecond() > late.now_us {
             return Err(AppError::InvalidQuery {
                 parameter: "to",

@@ -10,7 +10,7 @@ use tread_api::site::{Cell, Grid, Site};
 use super::area::Area;
 use super::cells::{factor, of_square, squares};
 use super::map_reader::smaller;
-use super::raster::PictureAsked;
+use super::raster::PictureRequest;
 use super::{App, AppError, MOVED, MapReader, Reading};
 use crate::app::segments::Batch;
 use crate::app::site_row;
@@ -65,17 +65,17 @@ impl App {
     pub async fn export_cells(
         &self,
         site: &SiteId,
-        asked: &PictureAsked,
+        request: &PictureRequest,
         writer_of: impl FnOnce(
             &Site,
             Option<Timestamp>,
         ) -> Result<Box<dyn Writer<CellFriction>>, TableError>,
     ) -> Result<CellExport, AppError> {
-        let mut reading = Reading::new(self, &asked.asked)?;
+        let mut reading = Reading::new(self, &request.parameters)?;
         let row = self.site_view(site).await?.row.clone();
         let grid = row.site.grid;
-        let factor = factor(&grid, asked.resolution_m)?;
-        let area = asked.area.unwrap_or(Area::WHOLE);
+        let factor = factor(&grid, request.resolution_m)?;
+        let area = request.area.unwrap_or(Area::WHOLE);
         let coarse = Grid {
             cell_m: grid.cell_m * f64::from(factor),
             ..grid
@@ -84,8 +84,11 @@ impl App {
         let stamp = self.maps().with_map(&row, SiteMap::stamp);
         reading.of_site(self, &row).await?;
         // Read before any chunk is made, so that later changes give another state.
-        let state = self.state_of(&row, &reading, asked);
-        let state = (self.run_id(), format!("{state:?} {:?} {asked:?}", row.site));
+        let state = self.state_of(&row, &reading, request);
+        let state = (
+            self.run_id(),
+            format!("{state:?} {:?} {request:?}", row.site),
+        );
         let as_of = reading.as_of;
         Ok(CellExport {
             app: self.clone(),

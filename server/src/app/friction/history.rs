@@ -84,11 +84,11 @@ impl App {
     pub async fn history_of_terrain(
         &self,
         (site, id): (&SiteId, &TerrainId),
-        asked: &ReadingParameters,
+        parameters: &ReadingParameters,
         times: Times,
     ) -> Result<TerrainHistory, AppError> {
         let times = times.checked(self)?;
-        let reading = Reading::new(self, asked)?;
+        let reading = Reading::new(self, parameters)?;
         let view = self.site_view(site).await?;
         let terrain = view.find(site, id)?.clone();
         let of_terrain = terrain_ref(&terrain);
@@ -107,12 +107,12 @@ impl App {
     pub async fn history_of_point(
         &self,
         site: &SiteId,
-        asked: &ReadingParameters,
+        parameters: &ReadingParameters,
         point: Point,
         times: Times,
     ) -> Result<PointHistory, AppError> {
         let times = times.checked(self)?;
-        let reading = Reading::new(self, asked)?;
+        let reading = Reading::new(self, parameters)?;
         let view = self.site_view(site).await?;
         let cell = view.cell_at(point)?;
         let terrain = PresentTerrains::new(&view.terrains).at(point).cloned();

@@ -64,7 +64,7 @@ pub(in crate::app) struct MapReader<'app> {
     turn: RefCell<Option<OwnedSemaphorePermit>>,
     /// Whether the map is read for a robot's mission, which waits for no request.
     is_for_robot: bool,
-    /// Nobody waits for the answer any more.
+    /// Cancelled when nobody waits for the answer any more.
     abandoned: CancellationToken,
 }
 
@@ -79,12 +79,12 @@ impl<'app> MapReader<'app> {
         self.app.maps().with_map(row, read)
     }
 
-    /// Reads the cells of a site's map. `read` is called again after blocks were loaded that it
-    /// needed, so it must not change anything.
+    /// Reads the cells of a site's map. If `read` needs blocks that are not in memory, they are loaded and
+    /// `read` is called again, so it must have no side effects.
     ///
     /// # Errors
-    /// The database failed; [`AppError::MapReadTooLarge`] if it needs too much at once;
-    /// [`AppError::Abandoned`] if nobody waits for the answer.
+    /// The database failed; [`AppError::MapReadTooLarge`] if it needs too many blocks at once;
+    /// [`AppError::Abandoned`] if the request was abandoned.
     pub(super) fn cells<T>(
         &self,
         row: &SiteRow,
@@ -153,7 +153,7 @@ impl App {
         self.run_map_reader(true, work).await
     }
 
-    /// Runs work beside the map on a blocking thread, which waits for no blocks.
+    /// Runs work that reads no blocks of the map on a blocking thread.
     pub(super) async fn compute<T: Send + 'static>(
         &self,
         work: impl FnOnce() -> T + Send + 'static,

@@ -31,7 +31,7 @@ use tread_api::terrain::{Terrain, TerrainRef};
 pub(super) use self::advice::CellCounts;
 pub use self::area::Area;
 pub(crate) use self::area::AreaBounds;
-pub use self::cells::{CELLS_MAX, CellsAsked};
+pub use self::cells::{CELLS_MAX, CellRequest};
 pub use self::export::{CellExport, SegmentExport};
 pub use self::history::Times;
 pub(super) use self::live::MapUpdates;
@@ -40,7 +40,7 @@ pub(super) use self::map_reader::ReaderSlots;
 pub use self::pictures::Picture;
 pub(super) use self::pictures::Pictures;
 use self::prior::Classes;
-pub use self::raster::{PictureAsked, SQUARES_MAX};
+pub use self::raster::{PictureRequest, SQUARES_MAX};
 pub(super) use self::reading::Reading;
 pub use self::reading::ReadingParameters;
 pub(super) use self::timelines::Timelines;
@@ -150,11 +150,11 @@ impl App {
     pub async fn friction_of_terrains(
         &self,
         site: &SiteId,
-        asked: &ReadingParameters,
+        parameters: &ReadingParameters,
         cursor: Option<&str>,
         limit: u32,
     ) -> Result<Page<TerrainFriction>, AppError> {
-        let reading = Reading::new(self, asked)?;
+        let reading = Reading::new(self, parameters)?;
         let view = self.site_view(site).await?;
         let row = view.row.clone();
         let cursor = cursor.map(str::to_owned);
@@ -184,9 +184,9 @@ impl App {
         &self,
         site: &SiteId,
         id: &TerrainId,
-        asked: &ReadingParameters,
+        parameters: &ReadingParameters,
     ) -> Result<TerrainFriction, AppError> {
-        let reading = Reading::new(self, asked)?;
+        let reading = Reading::new(self, parameters)?;
         let view = self.site_view(site).await?;
         let terrain = view.find(site, id)?.clone();
         let row = view.row.clone();

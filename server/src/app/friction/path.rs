@@ -50,12 +50,12 @@ impl App {
         let view = self.site_view(site).await?;
         let found = self.robot_of(view.row.pk, &robot).await?;
         let found = found.ok_or_else(|| AppError::UnknownRobot(site.clone(), robot.clone()))?;
-        let asked = ReadingParameters {
+        let parameters = ReadingParameters {
             as_of,
             configuration: Some(found.configuration),
             normalisation,
         };
-        let reading = Reading::new(self, &asked).map_err(in_body)?;
+        let reading = Reading::new(self, &parameters).map_err(in_body)?;
         let length_m = checked_length(&points)?;
         let cut = cut(&points, &view.row.site.grid)?;
         let row = view.row.clone();

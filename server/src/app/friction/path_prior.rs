@@ -28,10 +28,9 @@ impl App {
     /// Returns the prior of the ground along a trajectory, for the robot that drives it; `None`
     /// when nothing is known.
     ///
-    /// No θ is given for cells with several grounds, which the robot could not distinguish. The
-    /// traction limit of a ground is nowhere above its lowest known value on or near the path:
-    /// ground that is frozen in one cell may be frozen in the next, where nobody has measured
-    /// since.
+    /// Cells with several grounds get no θ, because the robot could not distinguish these. On the whole
+    /// path, the traction limit of a ground is at most its lowest known value on or near the path:
+    /// ground that is icy in one cell may also be icy in the next, which was not measured since.
     pub(in crate::app) async fn prior_along(
         &self,
         (site, robot): (&SiteId, &RobotId),
@@ -40,11 +39,11 @@ impl App {
         let view = self.site_view(site).await?;
         let found = self.robot_of(view.row.pk, robot).await?;
         let Some(found) = found else { return Ok(None) };
-        let asked = ReadingParameters {
+        let parameters = ReadingParameters {
             configuration: Some(found.configuration),
             ..ReadingParameters::default()
         };
-        let reading = Reading::new(self, &asked)?;
+        let reading = Reading::new(self, &parameters)?;
         let points = corners(trajectory);
         // A path that is too long to be read gets no prior.
         let Ok(cut) = checked_length(&points).and_then(|_| cut(&points, &view.row.site.grid))

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use tread_api::ids::SiteId;
 
-use super::raster::{Blocks, PictureAsked, raster};
+use super::raster::{Blocks, PictureRequest, raster};
 use super::{App, AppError, MapReader, Reading};
 use crate::db::sites::SiteRow;
 use crate::friction::Raster;
@@ -105,22 +105,22 @@ impl App {
     pub async fn picture(
         &self,
         site: &SiteId,
-        asked: PictureAsked,
+        request: PictureRequest,
         format: String,
         write: impl Fn(&Raster) -> Result<Vec<u8>, AppError> + Send + Sync + 'static,
     ) -> Result<Picture, AppError> {
-        let reading = Reading::new(self, &asked.asked)?;
+        let reading = Reading::new(self, &request.parameters)?;
         let view = self.site_view(site).await?;
         let row = view.row.clone();
         let drawing = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
             let app = reader.app();
-            let key = format!("{}/{format}/{asked:?}", view.row.pk);
+            let key = format!("{}/{format}/{request:?}", view.row.pk);
             // Read before the squares are made, so that a change meanwhile makes the picture stale.
-            let state = app.state_of(&view.row, reading, &asked);
+            let state = app.state_of(&view.row, reading, &request);
             if let Some(picture) = app.pictures().find(&key, state) {
                 return Ok(picture);
             }
-            let mut raster = raster(reader, &view, reading, &asked)?;
+            let mut raster = raster(reader, &view, reading, &request)?;
             let bytes: Arc<[u8]> = write(&raster)?.into();
             raster.squares = Vec::new();
             let of = Arc::new(raster);
@@ -131,9 +131,14 @@ impl App {
         self.read_map(&row, [reading], drawing).await
     }
 
-    pub(super) fn state_of(&self, row: &SiteRow, reading: &Reading, asked: &PictureAsked) -> State {
+    pub(super) fn state_of(
+        &self,
+        row: &SiteRow,
+        reading: &Reading,
+        request: &PictureRequest,
+    ) -> State {
         let grid = row.site.grid;
-        let bounds = asked.area.and_then(|area| area.cells(&grid).ok());
+        let bounds = request.area.and_then(|area| area.cells(&grid).ok());
         let bounds = bounds.map(|cells| Block::of(cells.min)..=Block::of(cells.max));
         self.maps().with_map(row, |map| State {
             change: match bounds {

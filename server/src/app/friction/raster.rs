@@ -30,9 +30,9 @@ const CELLS_PER_READ: i32 = 2_048;
 
 /// The content of a requested picture.
 #[derive(Debug, Clone, Default)]
-pub struct PictureAsked {
-    /// Configuration, normalisation and time.
-    pub asked: ReadingParameters,
+pub struct PictureRequest {
+    /// Configuration, normalisation and time of the reading.
+    pub parameters: ReadingParameters,
     /// The area; `None` for everything that was driven on.
     pub area: Option<Area>,
     /// Side of the squares, metres; `None` for the grid's own cells.
@@ -257,7 +257,7 @@ pub(super) fn raster(
     reader: &MapReader<'_>,
     view: &SiteView,
     reading: &Reading,
-    picture: &PictureAsked,
+    picture: &PictureRequest,
 ) -> Result<Raster, AppError> {
     let grid = view.row.site.grid;
     let reference = reading.reference();

@@ -44,15 +44,15 @@ pub(in crate::app) struct Reading {
 }
 
 impl Reading {
-    pub(in crate::app) fn new(app: &App, asked: &ReadingParameters) -> Result<Self, AppError> {
+    pub(in crate::app) fn new(app: &App, parameters: &ReadingParameters) -> Result<Self, AppError> {
         let now = app.clock().now();
-        if let Some(as_of) = asked.as_of.filter(|&as_of| as_of > now) {
+        if let Some(as_of) = parameters.as_of.filter(|&as_of| as_of > now) {
             return Err(AppError::InvalidQuery {
                 parameter: "as_of",
                 detail: format!("as_of must not lie in the future; {as_of} does"),
             });
         }
-        let normalisation = asked.normalisation.as_ref().map(|name| {
+        let normalisation = parameters.normalisation.as_ref().map(|name| {
             let known = app.normalisations().iter();
             let mut known = known.filter(|normalisation| normalisation.name == *name);
             known.next().cloned().ok_or_else(|| AppError::InvalidQuery {
@@ -61,13 +61,13 @@ impl Reading {
             })
         });
         Ok(Self {
-            as_of: asked.as_of,
+            as_of: parameters.as_of,
             timeline: None,
             partial: None,
-            configuration: asked.configuration,
+            configuration: parameters.configuration,
             normalisation: normalisation.transpose()?,
             config: *app.friction_config(),
-            now_us: asked.as_of.unwrap_or(minute_of(now)).as_microsecond(),
+            now_us: parameters.as_of.unwrap_or(minute_of(now)).as_microsecond(),
         })
     }
 

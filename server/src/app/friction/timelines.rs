@@ -28,7 +28,7 @@ const READ_AT_ONCE: u32 = 4_096;
 /// Maximum number of times that one request reads for one timeline; the next request reads on.
 const READ_MAX: usize = 100;
 /// Number of times after which what was read is cached, in case that the request ends.
-const KEPT_EVERY: usize = 16;
+const CACHED_EVERY: usize = 16;
 
 /// Cache of timelines.
 #[derive(Debug, Default)]
@@ -158,7 +158,7 @@ impl App {
             let withdrawals = Arc::clone(&withdrawals);
             let adding = move || kept.with(&rows, &withdrawals);
             kept = self.compute(adding).await;
-            if batch % KEPT_EVERY == 0 {
+            if batch % CACHED_EVERY == 0 {
                 self.timelines().insert(kept.clone());
             }
         }

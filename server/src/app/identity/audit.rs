@@ -58,7 +58,7 @@ const FORGET_MAX: u32 = 1_000;
 /// Number of own entries that an author may write in a burst.
 pub const SHARE_BURST: u32 = 600;
 /// The same number for all requests without a valid credential, together.
-const STRANGERS_BURST: u32 = 60;
+const UNAUTHENTICATED_BURST: u32 = 60;
 /// Interval after which an author may write one more entry.
 const SHARE_INTERVAL: Duration = Duration::from_secs(30);
 /// Maximum number of authors whose allowances are tracked; beyond it the one with the fullest
@@ -97,7 +97,7 @@ impl Author {
     const fn limit(self) -> RateLimit {
         let burst = match self {
             Self::Token(_) | Self::Person(_) | Self::Joining => SHARE_BURST,
-            Self::Stranger => STRANGERS_BURST,
+            Self::Stranger => UNAUTHENTICATED_BURST,
         };
         RateLimit {
             burst,
@@ -192,7 +192,7 @@ impl Share {
     }
 }
 
-/// A token or session whose last use is stored.
+/// Identifier of a credential, as key of the time of its last use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum UsedCredential {
     Token(TokenId),

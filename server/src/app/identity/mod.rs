@@ -49,7 +49,7 @@ use crate::identity::subject::SubjectId;
 /// Maximum number of sessions of one token or person; opening another ends the oldest.
 pub const SESSIONS_EACH_MAX: u32 = 20;
 /// Maximum duration of a session; it also ends with its token.
-pub const SESSION_LASTS: SignedDuration = SignedDuration::from_hours(12);
+pub const SESSION_LIFETIME_MAX: SignedDuration = SignedDuration::from_hours(12);
 /// Maximum time that a request waits for the check of a cached credential.
 const RECHECK_MAX: Duration = Duration::from_millis(250);
 /// Maximum number of repetitions of a look-up during which something was ended.

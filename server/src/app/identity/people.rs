@@ -59,7 +59,7 @@ const USED_MAX: usize = 4_096;
 const FIND_AGAIN_MIN: Duration = Duration::from_secs(1);
 const FIND_AGAIN_MAX: Duration = Duration::from_secs(30);
 /// Interval at which the metadata of a known provider are read again.
-const LOOK_AGAIN: Duration = Duration::from_hours(1);
+const METADATA_REFRESH: Duration = Duration::from_hours(1);
 
 /// Reason why a person is not signed in.
 #[derive(Debug, thiserror::Error)]
@@ -104,11 +104,11 @@ pub enum PersonError {
 /// A browser begins a sign-in at a host name other than that of `public_url`.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "a browser asks for it at `{asked}`, and is sent to `public_url`, {home}; if it asked for that, a proxy \
+    "a browser asks for it at `{host}`, and is sent to `public_url`, {home}; if it asked for that, a proxy \
      does not pass the `Host` header on"
 )]
 struct OtherHost {
-    asked: String,
+    host: String,
     home: Origin,
 }
 
@@ -151,7 +151,7 @@ pub struct People {
     used: Mutex<CompletedSignIns>,
     pub(super) id_tokens: IdTokens,
     /// Notified when somebody wants to sign in while the provider is not known.
-    wanted: Notify,
+    sign_in_waiting: Notify,
 }
 
 /// States of completed sign-ins, with the oldest first in `order`.
@@ -182,7 +182,7 @@ impl People {
             networks: Mutex::default(),
             used: Mutex::default(),
             id_tokens: IdTokens::default(),
-            wanted: Notify::new(),
+            sign_in_waiting: Notify::new(),
         })
     }
 
@@ -191,7 +191,7 @@ impl People {
         self.provider.issuer()
     }
 
-    /// Returns the groups whose grants are within a scope, and those whose grants are not.
+    /// Returns two lists of groups: those whose grants are within a scope, and all others.
     pub(super) fn groups_by_scope(&self, within: &Scope) -> (Vec<&str>, Vec<&str>) {
         let is_within = |name: &&str| {
             let grant = self
@@ -238,7 +238,7 @@ impl People {
     fn is_found(&self) -> bool {
         let is_known = self.provider.is_known();
         if !is_known {
-            self.wanted.notify_one();
+            self.sign_in_waiting.notify_one();
         }
         is_known
     }
@@ -263,8 +263,8 @@ impl People {
         true
     }
 
-    fn signed_in(&self, there: &AuthenticatedPerson) -> Result<SignedIn, PersonError> {
-        let (subject, claims) = (&there.subject, &there.claims);
+    fn signed_in(&self, authenticated: &AuthenticatedPerson) -> Result<SignedIn, PersonError> {
+        let (subject, claims) = (&authenticated.subject, &authenticated.claims);
         let issuer = self.issuer().to_owned();
         let person = Person {
             id: PersonId::of(OidcSubject {
@@ -327,17 +327,20 @@ impl App {
     ///
     /// # Errors
     /// No provider is configured, or it is not known yet.
-    pub fn begin_sign_in(&self, asked: &Provenance<'_>) -> Result<SignInRedirect, PersonError> {
+    pub fn begin_sign_in(
+        &self,
+        provenance: &Provenance<'_>,
+    ) -> Result<SignInRedirect, PersonError> {
         let people = self.people().ok_or(PersonError::NotConfigured)?;
-        let is_at_home = asked.is_at(&people.home);
+        let is_at_home = provenance.is_at(&people.home);
         if !is_at_home {
             let error = OtherHost {
-                asked: cleaned(asked.host.unwrap_or_default(), HOST_SHOWN_MAX),
+                host: cleaned(provenance.host.unwrap_or_default(), HOST_SHOWN_MAX),
                 home: people.home.clone(),
             };
             self.log_failure("begin a sign-in", &error);
         }
-        if !is_at_home || !asked.is_no_foreign_page() {
+        if !is_at_home || !provenance.is_no_foreign_page() {
             return Ok(SignInRedirect {
                 location: format!("{}/", people.home),
                 cookie: None,
@@ -347,7 +350,7 @@ impl App {
         getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
         let pending = Pending::begin(&people.key, &random, self.clock().now());
         let Some(location) = people.provider.sign_in_url(&pending) else {
-            people.wanted.notify_one();
+            people.sign_in_waiting.notify_one();
             self.log_failure("sign people in", &ExchangeError::Unknown);
             return Err(PersonError::Unavailable);
         };
@@ -385,9 +388,9 @@ impl App {
             (_, None) => return Err(PersonError::NotBegun),
         };
         let turn = people.turn(address).await.ok_or(PersonError::Busy)?;
-        let there = people.provider.exchange(code, &pending).await;
+        let authenticated = people.provider.exchange(code, &pending).await;
         drop(turn);
-        let there = there.map_err(|error| match error {
+        let authenticated = authenticated.map_err(|error| match error {
             ExchangeError::Unknown | ExchangeError::Unanswered(_) | ExchangeError::KeysUnknown => {
                 self.log_failure("sign people in", &error);
                 PersonError::Unavailable
@@ -403,13 +406,15 @@ impl App {
         if !people.consume_state(&pending.state) {
             return Err(PersonError::NotBegun);
         }
-        let mut signed_in = people.signed_in(&there)?;
-        signed_in.name = self.unlike_tokens(signed_in.name, &there.subject).await?;
+        let mut signed_in = people.signed_in(&authenticated)?;
+        signed_in.name = self
+            .distinct_from_tokens(signed_in.name, &authenticated.subject)
+            .await?;
         let expires_at = now.checked_add(people.session_lasts);
         let expires_at = expires_at.unwrap_or(Timestamp::MAX);
         let opened = self.open_session_of(Owner::Person(signed_in), expires_at);
         let (credential, secret) = opened.await?.ok_or(PersonError::NotBelieved)?;
-        if let (Some(session), Some(id_token)) = (credential.session, there.id_token) {
+        if let (Some(session), Some(id_token)) = (credential.session, authenticated.id_token) {
             people.id_tokens.insert(session, id_token);
         }
         Ok((credential, secret))
@@ -417,7 +422,7 @@ impl App {
 
     /// Returns a name for the person that differs from the name of every valid token. New tokens
     /// cannot have such a name, but those of earlier versions may.
-    async fn unlike_tokens(&self, name: String, subject: &str) -> Result<String, AppError> {
+    async fn distinct_from_tokens(&self, name: String, subject: &str) -> Result<String, AppError> {
         let mut tx = self.db().read("identity").await?;
         let called = name_of_person(&name);
         let taken = db::tokens::valid_by_name(&mut tx, &called, self.clock().now()).await?;
@@ -455,7 +460,7 @@ pub async fn run(app: App, stop: CancellationToken) {
                     info!("people can sign in at {}", people.issuer());
                 }
                 rest = FIND_AGAIN_MIN;
-                LOOK_AGAIN
+                METADATA_REFRESH
             }
             Err(error) => {
                 app.log_failure("find the OpenID provider", &error);
@@ -464,14 +469,14 @@ pub async fn run(app: App, stop: CancellationToken) {
                 wait
             }
         };
-        let wanted = async {
+        let sign_in_waits = async {
             // Waits at least this long, however many people want to sign in.
             tokio::time::sleep(FIND_AGAIN_MIN).await;
-            people.wanted.notified().await;
+            people.sign_in_waiting.notified().await;
         };
         tokio::select! {
             () = tokio::time::sleep(wait) => {}
-            () = wanted => {}
+            () = sign_in_waits => {}
             () = stop.cancelled() => return,
         }
     }

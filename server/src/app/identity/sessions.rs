@@ -8,7 +8,7 @@ use tread_api::ids::SessionId;
 use tread_api::page::Page;
 use tread_api::rights::Scope;
 
-use super::{Credential, SESSION_LASTS, SESSIONS_EACH_MAX, SignInError, new_secret};
+use super::{Credential, SESSION_LIFETIME_MAX, SESSIONS_EACH_MAX, SignInError, new_secret};
 use crate::app::{App, AppError, page};
 use crate::db::sessions::{NewSession, Owner, PeopleSessionFilter, SessionRow};
 use crate::db::{self, DbError, Tx};
@@ -31,7 +31,7 @@ impl App {
             let detail = "a session is opened with a token".to_owned();
             return Err(AppError::BeyondRights(detail));
         };
-        let lasts_until = self.clock().now().checked_add(SESSION_LASTS);
+        let lasts_until = self.clock().now().checked_add(SESSION_LIFETIME_MAX);
         let lasts_until = lasts_until.unwrap_or(Timestamp::MAX);
         let expires_at = lasts_until.min(credential.expires_at);
         let opened = self.open_session_of(Owner::Token(token), expires_at);

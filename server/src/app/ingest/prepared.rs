@@ -25,7 +25,9 @@ pub(in crate::app) const SKEW_MIN: SignedDuration = SignedDuration::from_secs(30
 
 impl Skew {
     pub(super) fn of(robot_time: Option<Timestamp>, now: Timestamp) -> Self {
-        let ahead = robot_time.map_or(SignedDuration::ZERO, |said| said.duration_since(now));
+        let ahead = robot_time.map_or(SignedDuration::ZERO, |robot_time| {
+            robot_time.duration_since(now)
+        });
         let ahead = if ahead.abs() > SKEW_MIN {
             ahead
         } else {

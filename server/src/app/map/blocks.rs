@@ -40,7 +40,7 @@ const EVICT_EVERY_MIN: Duration = Duration::from_millis(100);
 /// Number of blocks that are evicted at a time under the lock of the map.
 const EVICTED_AT_ONCE: usize = 256;
 
-/// What the blocks of all maps take, and what happened to them since the start.
+/// Memory used by the blocks of all maps, and counters since the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct BlockCounts {
     /// Number of blocks with measurements.

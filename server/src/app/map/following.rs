@@ -112,8 +112,8 @@ impl Follower {
 }
 
 impl App {
-    /// Brings the map of a standby up to date; `false` if it has to be read as a whole, since another server
-    /// has the database now, or the database has lost what is on the map, or removed what is not.
+    /// Updates the map of a standby. Returns `false` if the whole map has to be read again: another server has
+    /// become active, the database lacks measurements that the map has, or removed some that the map lacks.
     ///
     /// # Errors
     /// The database failed.
@@ -331,14 +331,14 @@ impl App {
         Ok(())
     }
 
-    /// Returns the address of the server that has the database, as it says itself; `None` if it says none, or
-    /// in that server.
+    /// Returns the address that the active server advertises; `None` if it advertises none, or in the active
+    /// server.
     pub fn leader_url(&self) -> Option<String> {
         self.maps().follower()?.seen().leader.advertise_url.clone()
     }
 
-    /// Returns for how long the map of a standby has not been up to date; `None` before it was for the first
-    /// time, or in the server that has the database.
+    /// Returns the time since the map of a standby was last up to date; `None` before its first update, or in
+    /// the active server.
     pub fn map_age(&self) -> Option<Duration> {
         let at = self.maps().follower()?.seen().at?;
         Some(at.elapsed())

@@ -2,8 +2,8 @@
 //!
 //! ```text
 //! commit of segments ─► added here and to the map ─► stored with the robot's watermark ─► removed
-//! kill ─► nothing here; the segments that follow each watermark are added again
-//! block of cells read ─► those that its snapshot of the stored sums lacks are added to it
+//! restart ─► empty; the segments that follow each watermark are added again
+//! a block of cells is read ─► sums that its snapshot of the database lacks are added to the block
 //! ```
 //!
 //! The sums of a robot are stored up to a watermark, so those of the same segments are stored in one
@@ -159,8 +159,8 @@ impl Unwritten {
         }
     }
 
-    /// Says that the segments with these keys are in the newest generation of a robot, if those before them
-    /// are that were committed with them, although they add nothing to it.
+    /// Extends the key range of a robot's newest generation to `keys`: segments that add nothing to the sums, but
+    /// were committed together with segments of that generation.
     pub(super) fn cover(&mut self, robot_pk: i64, keys: Added) {
         let newest = self.robots.get_mut(&robot_pk);
         if let Some(newest) = newest.and_then(VecDeque::back_mut)
@@ -170,13 +170,13 @@ impl Unwritten {
         }
     }
 
-    /// Sets the stored watermarks, which all sums follow that are added.
+    /// Sets the stored watermarks. All sums that are added later must follow them.
     pub(super) fn start_at(&mut self, watermarks: HashMap<i64, i64>) {
         self.watermarks = watermarks;
     }
 
-    /// Returns whether a generation is stored in part by these watermarks, so that [`Self::since`] cannot
-    /// tell what is stored.
+    /// Returns whether one of these watermarks lies within a generation: then [`Self::since`] cannot determine
+    /// which of its sums are stored.
     pub(super) fn is_divided_by(&self, watermarks: &HashMap<i64, i64>) -> bool {
         self.robots.iter().any(|(robot_pk, generations)| {
             let stored_to = watermarks.get(robot_pk).copied().unwrap_or_default();
@@ -264,7 +264,7 @@ impl Unwritten {
         portion
     }
 
-    /// Removes the sums of a portion, which are stored now. Nothing was added meanwhile.
+    /// Removes the sums of a portion after they were stored. No sums may have been added since it was taken.
     pub(super) fn written(&mut self, steps: &[WatermarkStep]) {
         for step in steps {
             self.watermarks.insert(step.robot_pk, step.to_pk);
@@ -298,7 +298,7 @@ impl Unwritten {
         number
     }
 
-    /// Ends a read of blocks. Returns what was kept for it alone.
+    /// Ends a read of blocks. Returns the stored sums that were kept for this read only.
     pub(super) fn end_read(&mut self, number: u64) -> Vec<StoredDuringRead> {
         self.reads.remove(&number);
         let oldest = self.reads.first().copied().unwrap_or(self.next_read);

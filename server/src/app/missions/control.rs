@@ -50,12 +50,8 @@ impl App {
         self.request_pause(id, false).await
     }
 
-    async fn request_pause(
-        &self,
-        id: MissionId,
-        requested: bool,
-    ) -> Result<MissionDetail, AppError> {
-        let (asked, cause) = if requested {
+    async fn request_pause(&self, id: MissionId, pauses: bool) -> Result<MissionDetail, AppError> {
+        let (action, cause) = if pauses {
             ("paused", Cause::PauseRequested)
         } else {
             ("resumed", Cause::ResumeRequested)
@@ -66,28 +62,28 @@ impl App {
         let state = mission.state;
         // A queued mission that was held because its robot was stopped or teleoperated can be
         // resumed.
-        let held_in_queue = state == MissionState::Queued && mission.pause_requested && !requested;
+        let held_in_queue = state == MissionState::Queued && mission.pause_requested && !pauses;
         let in_progress = matches!(
             state,
             MissionState::Offered | MissionState::Active | MissionState::Paused
         );
         if !in_progress && !held_in_queue {
-            return Err(AppError::MissionState { id, state, asked });
+            return Err(AppError::MissionState { id, state, action });
         }
-        if !requested {
+        if !pauses {
             self.check_free(&mut tx, mission).await?;
         }
-        if requested && !robot_of(&mut tx, &row).await?.capabilities.pause {
+        if pauses && !robot_of(&mut tx, &row).await?.capabilities.pause {
             return Err(AppError::RobotCannot {
                 robot: mission.robot.clone(),
                 what: "pause a mission",
             });
         }
-        if mission.pause_requested != requested
-            && db::missions::set_pause_requested(&mut tx, id, requested).await?
+        if mission.pause_requested != pauses
+            && db::missions::set_pause_requested(&mut tx, id, pauses).await?
         {
             let why = (Actor::Client, cause);
-            let reason = format!("to be {asked}");
+            let reason = format!("to be {action}");
             add_note(&mut tx, mission, why, self.clock().now(), &reason).await?;
         }
         self.written(tx, id).await
@@ -120,7 +116,7 @@ impl App {
         id: MissionId,
         request: ReplaceMission,
     ) -> Result<MissionDetail, AppError> {
-        let asked = "replaced";
+        let action = "replaced";
         let mut tx = self.db().read("missions").await?;
         let row = open_row(&mut tx, id).await?;
         drop(tx);
@@ -159,7 +155,7 @@ impl App {
             }
             db::missions::set_replacement(&mut tx, id, Some(&replacement)).await?;
         } else {
-            return Err(AppError::MissionState { id, state, asked });
+            return Err(AppError::MissionState { id, state, action });
         }
         let reason = format!("to be driven as revision {revision}");
         add_note(&mut tx, mission, why, at, &reason).await?;

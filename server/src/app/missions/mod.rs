@@ -263,8 +263,8 @@ impl App {
             let presence = self
                 .presences()
                 .get(&(mission.site.clone(), mission.robot.clone()));
-            let said = presence.state().and_then(|state| state.mission);
-            if let Some(progress) = said.filter(|progress| progress.id == mission.id) {
+            let progress = presence.state().and_then(|state| state.mission);
+            if let Some(progress) = progress.filter(|progress| progress.id == mission.id) {
                 mission.progress = Some(progress);
             }
         }

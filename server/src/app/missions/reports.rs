@@ -124,11 +124,11 @@ fn content_of(
     mission: &Mission,
     restored_at: Option<Timestamp>,
 ) -> Content {
-    let said = (report.revision, report.plan_hash);
+    let content = (report.revision, report.plan_hash);
     let replacement = mission.replacement.as_ref();
-    if said == (mission.revision, mission.plan_hash) {
+    if content == (mission.revision, mission.plan_hash) {
         Content::Present
-    } else if replacement.is_some_and(|next| said == (next.revision, next.plan_hash)) {
+    } else if replacement.is_some_and(|next| content == (next.revision, next.plan_hash)) {
         Content::Replacement
     } else if report.revision < mission.revision {
         Content::Earlier
@@ -156,8 +156,8 @@ const fn is_end(phase: MissionPhase) -> bool {
 
 /// Returns why a report exceeds the limits that agents observe; `None` if it does not.
 fn impossible(report: &MissionReport) -> Option<String> {
-    let samples = report.quality.as_ref().map_or(0, |said| said.theta.len());
-    let points = report.driven.as_ref().map_or(0, |said| said.points.len());
+    let samples = report.quality.as_ref().map_or(0, |part| part.theta.len());
+    let points = report.driven.as_ref().map_or(0, |part| part.points.len());
     if samples > THETA_SAMPLES_MAX {
         Some(format!(
             "a quality report has at most {THETA_SAMPLES_MAX} samples of theta"
@@ -169,7 +169,7 @@ fn impossible(report: &MissionReport) -> Option<String> {
     } else if report
         .driven
         .as_ref()
-        .is_some_and(|said| !said.has_possible_times())
+        .is_some_and(|part| !part.has_possible_times())
     {
         Some("a driven path has a time for each of its points, in order, or none".to_owned())
     } else {
@@ -233,7 +233,7 @@ async fn apply_phase(
     // The robot's answer to the command has caused this transition already.
     let is_known = open && next_is_reached(change, mission);
     // An agent that was killed while it recorded this end reports it again.
-    let is_known = is_known || has_ended_so(tx, mission, change, reason).await?;
+    let is_known = is_known || has_same_end(tx, mission, change, reason).await?;
     if is_known {
         return Ok(None);
     }
@@ -247,7 +247,7 @@ async fn apply_phase(
 
 /// Returns whether the robot's own report has ended the mission already by this change and for this
 /// reason.
-async fn has_ended_so(
+async fn has_same_end(
     tx: &mut Tx,
     mission: &Mission,
     change: Change,
@@ -281,10 +281,10 @@ fn shown_of(reporting: Reporting, report: &MissionReport) -> Option<MissionProgr
         .filter(|_| is_end(report.phase))
 }
 
-/// Returns whether a person resumed a mission after `at`: a pause from before that, reported late,
-/// is then no longer wanted. `at` is the time at which the stop or lease began. It must end before
-/// anybody can resume, so this time tells both orders apart with a margin larger than clock errors;
-/// the time at which the robot stopped does not.
+/// Returns whether a person resumed a mission after `at`, the time at which a stop or lease began. The
+/// pause that it caused, if the robot reports it late, is then obsolete. The begin of the stop or lease
+/// is used because nobody can resume before its end: the order is unambiguous in spite of
+/// clock errors, which is not true for the time at which the robot came to rest.
 pub(in crate::app) async fn was_resumed_since(
     tx: &mut Tx,
     id: MissionId,

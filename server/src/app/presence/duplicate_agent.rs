@@ -16,7 +16,7 @@ use super::{Presence, Presences, RobotKey};
 /// than messages of a replaced agent can be under way.
 const DUPLICATE_AFTER: Duration = Duration::from_secs(1);
 /// Time without a heartbeat after which a second agent counts as gone.
-const DUPLICATE_GONE: Duration = Duration::from_secs(3);
+const DUPLICATE_TIMEOUT: Duration = Duration::from_secs(3);
 /// Code of the alert about two agents under one name.
 const DUPLICATE_ALERT: &str = "two-agents";
 
@@ -105,7 +105,7 @@ impl Presences {
             let Some(other) = presence.other else {
                 continue;
             };
-            if now.saturating_sub(other.heard_at) > DUPLICATE_GONE {
+            if now.saturating_sub(other.heard_at) > DUPLICATE_TIMEOUT {
                 presence.remove_other();
             } else if other.is_duplicate {
                 duplicates.push(DuplicateAgent {

@@ -38,7 +38,7 @@ pub const OFFLINE_TIMEOUT: Duration = Duration::from_millis(1_400);
 const SUDDEN: Duration = Duration::from_secs(1);
 
 /// Maximum number of robots in memory; beyond it no further robot is added for its token alone.
-const STRANGERS_MAX: usize = 20_000;
+const ROBOTS_BY_TOKEN_MAX: usize = 20_000;
 
 /// Effect of a robot's message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -67,9 +67,9 @@ pub struct Presence {
     /// increased.
     heard_at: Option<Duration>,
     /// Time of the last message of any kind.
-    spoken_at: Option<Duration>,
+    last_message_at: Option<Duration>,
     /// Whether the last token vanished shortly after a heartbeat.
-    went_suddenly: bool,
+    vanished_suddenly: bool,
     /// Offsets of the robot's wall clock, robot minus server, milliseconds, of the last states. The
     /// largest is of the state with the shortest delay.
     clock_offsets_ms: Offsets,
@@ -108,23 +108,25 @@ impl Presence {
         if self.link(now) == LinkState::Online {
             return None;
         }
-        let speaks = self
-            .spoken_at
+        let is_recent = self
+            .last_message_at
             .is_some_and(|at| now.saturating_sub(at) <= ONLINE_TIMEOUT);
-        Some(if self.spoken_at.is_none() && self.tokens.is_empty() {
-            LinkCause::ServerRestarted
-        } else if self.tokens.is_empty() && self.went_suddenly {
-            LinkCause::RobotOff
-        } else if self.heard_at.is_none() && !self.tokens.is_empty() {
-            LinkCause::Joining
-        } else if speaks && !self.tokens.is_empty() {
-            LinkCause::LoopStopped
-        } else {
-            LinkCause::LinkDown
-        })
+        Some(
+            if self.last_message_at.is_none() && self.tokens.is_empty() {
+                LinkCause::ServerRestarted
+            } else if self.tokens.is_empty() && self.vanished_suddenly {
+                LinkCause::RobotOff
+            } else if self.heard_at.is_none() && !self.tokens.is_empty() {
+                LinkCause::Joining
+            } else if is_recent && !self.tokens.is_empty() {
+                LinkCause::LoopStopped
+            } else {
+                LinkCause::LinkDown
+            },
+        )
     }
 
-    /// Returns whether the agent's last state says that it leaves.
+    /// Returns whether the agent announced in its last state that it stops.
     pub fn has_left(&self) -> bool {
         self.state().is_some_and(|state| state.leaving)
     }
@@ -171,12 +173,12 @@ impl Presence {
         shown.or_else(|| self.drivers.values().next().map(String::as_str))
     }
 
-    /// Returns whether a message came within [`OFFLINE_TIMEOUT`], or a liveliness token is there.
-    pub fn is_there(&self, now: Duration) -> bool {
-        let spoke = self
-            .spoken_at
+    /// Returns whether a message came within [`OFFLINE_TIMEOUT`], or a liveliness token exists.
+    pub fn is_connected(&self, now: Duration) -> bool {
+        let is_recent = self
+            .last_message_at
             .is_some_and(|at| now.saturating_sub(at) <= OFFLINE_TIMEOUT);
-        spoke || !self.tokens.is_empty()
+        is_recent || !self.tokens.is_empty()
     }
 
     /// Returns the time since the last state arrived.
@@ -229,7 +231,7 @@ impl Presence {
 
     /// Returns the quality of the robot's link; `None` if it has sent nothing.
     pub fn link_quality(&self, now: Duration) -> Option<LinkQuality> {
-        self.spoken_at?;
+        self.last_message_at?;
         let offsets = &self.clock_offsets_ms;
         let variation_ms = offsets.largest().zip(offsets.newest());
         let variation_ms = variation_ms.map(|(fastest, newest)| fastest.abs_diff(newest));
@@ -306,7 +308,7 @@ impl Presences {
     pub fn token_appeared(&self, key: RobotKey, boot: BootId, now: Duration) {
         let mut robots = self.lock();
         // A token may come before its robot's hello; the number of such robots is limited.
-        if !robots.contains_key(&key) && robots.len() >= STRANGERS_MAX {
+        if !robots.contains_key(&key) && robots.len() >= ROBOTS_BY_TOKEN_MAX {
             return;
         }
         let presence = robots.entry(key).or_default();
@@ -320,7 +322,7 @@ impl Presences {
         if let Some(presence) = robots.get_mut(key) {
             presence.tokens.remove(&boot);
             let silent = presence.silent_for(now);
-            presence.went_suddenly = silent.is_none_or(|silent| silent <= SUDDEN);
+            presence.vanished_suddenly = silent.is_none_or(|silent| silent <= SUDDEN);
             if !presence.welcomed && presence.tokens.is_empty() {
                 robots.remove(key);
             }
@@ -360,12 +362,12 @@ impl Presences {
         let mut robots = self.lock();
         let presence = robots.entry(key).or_default();
         // A hello is the first message of each connection.
-        if presence.spoken_at.is_some() {
+        if presence.last_message_at.is_some() {
             presence.link_counts.reconnect(now);
         }
         presence.welcomed = true;
         presence.enter_boot(boot, now);
-        presence.spoken_at = Some(now);
+        presence.last_message_at = Some(now);
     }
 
     /// Records a robot's state, received at `now`.
@@ -402,7 +404,7 @@ impl Presences {
         if beats {
             presence.heard_at = Some(now);
         }
-        presence.spoken_at = Some(now);
+        presence.last_message_at = Some(now);
         if presence
             .state()
             .is_some_and(|before| before.seq >= state.seq)
@@ -427,8 +429,8 @@ impl Presences {
         if let Some(ahead_us) = monotonic_offset_us(&state, now) {
             presence.monotonic_offsets_us.push(now, ahead_us);
         }
-        let said = presence.state().map(|before| &before.alerts);
-        presence.alerts_changed |= said != Some(&state.alerts);
+        let reported = presence.state().map(|before| &before.alerts);
+        presence.alerts_changed |= reported != Some(&state.alerts);
         presence.progress = state.mission.or(presence.progress);
         presence.state = Some((state, now));
         if has_changed || !was_online {

@@ -1,8 +1,8 @@
-//! Offsets of a robot's clock, of its last states.
+//! Offset of a robot's clock from the server's, estimated from its last states.
 //!
 //! The offset of one state is too small by the delay of the state, so the largest of several is the
-//! best. Those of a time count, at whatever rate states arrive, and of a robot that sends seldom at
-//! least a number of them.
+//! best estimate. All states of the last [`OFFSETS_SPAN`] are used; if these are fewer than
+//! [`OFFSETS_MIN`], the last [`OFFSETS_MIN`] states are used.
 
 use std::collections::VecDeque;
 use std::time::Duration;

@@ -30,7 +30,7 @@ pub(in crate::app) const LOST_AFTER: Duration = Duration::from_secs(15);
 /// Time for which a robot must be heard again before its alert is cleared.
 pub(in crate::app) const BACK_AFTER: Duration = Duration::from_secs(3);
 /// Minimum interval between two checks: in a large fleet the reconciler is woken far more often.
-const LOOK_EVERY: Duration = Duration::from_millis(500);
+const CHECK_EVERY: Duration = Duration::from_millis(500);
 /// Time after the start of the server in which no robot counts as lost, since all of them must
 /// reconnect.
 pub(in crate::app) const START_GRACE: Duration = Duration::from_secs(30);
@@ -70,13 +70,13 @@ struct Now {
 
 impl RobotAttendance {
     /// Returns the transition that follows from a check; the caller applies it once it is stored.
-    fn judge(&mut self, look: ObservedLink, now: Now) -> Option<Turn> {
-        if !look.is_heard {
+    fn judge(&mut self, observed: ObservedLink, now: Now) -> Option<Turn> {
+        if !observed.is_heard {
             self.heard_since = None;
-            if look.has_left {
+            if observed.has_left {
                 return self.is_present.then_some(Turn::Left);
             }
-            let is_over = look.silent >= LOST_AFTER && now.uptime >= START_GRACE;
+            let is_over = observed.silent >= LOST_AFTER && now.uptime >= START_GRACE;
             return (self.is_present && is_over).then_some(Turn::Lost);
         }
         let since = *self.heard_since.get_or_insert(now.elapsed);
@@ -110,7 +110,7 @@ impl Attendance {
     /// The database failed; the next check repeats this one.
     pub(super) async fn check(&mut self, app: &App) -> Result<(), AppError> {
         let elapsed = app.clock().elapsed();
-        let is_early = |looked_at: Duration| elapsed.saturating_sub(looked_at) < LOOK_EVERY;
+        let is_early = |looked_at: Duration| elapsed.saturating_sub(looked_at) < CHECK_EVERY;
         if self.looked_at.is_some_and(is_early) {
             return Ok(());
         }
@@ -124,14 +124,14 @@ impl Attendance {
         };
         for (key, attending) in app.presences().attending(elapsed) {
             let seen = robots.entry(key.clone()).or_default();
-            let look = ObservedLink {
+            let observed = ObservedLink {
                 is_heard: attending.is_heard,
                 has_left: attending.has_left,
                 // A robot that was never heard has been silent at least since the start.
                 silent: attending.silent_for.unwrap_or(now.uptime),
             };
-            if let Some(turn) = seen.judge(look, now) {
-                write_down(app, &key, turn, attending.cause).await?;
+            if let Some(turn) = seen.judge(observed, now) {
+                store_transition(app, &key, turn, attending.cause).await?;
                 seen.apply(turn);
             }
         }
@@ -154,7 +154,7 @@ async fn expected(app: &App) -> Result<HashMap<RobotKey, RobotAttendance>, AppEr
     Ok(expected.into_iter().map(seen).collect())
 }
 
-async fn write_down(
+async fn store_transition(
     app: &App,
     key: &RobotKey,
     turn: Turn,
@@ -171,7 +171,7 @@ async fn write_down(
     let is_there = matches!(turn, Turn::Came | Turn::Back);
     db::attendance::set_present(&mut tx, row.pk, is_there).await?;
     // No alert for a robot that was retired or revoked.
-    let is_missed = row.retired_at.is_none() && app.enrolment_registry().may_speak(key);
+    let is_missed = row.retired_at.is_none() && app.enrolment_registry().may_send(key);
     let alert = match turn {
         Turn::Lost if is_missed => {
             let alert = OwnAlert {

@@ -24,7 +24,7 @@ pub(in crate::app) const ROBOT_WAITING_ALERT: &str = "robot-waiting";
 pub(in crate::app) const CLOCK_WRONG_ALERT: &str = "clock-wrong";
 /// Time without progress on its mission after which a robot has waited too long, for whatever
 /// reason: a pause, a stop, a limit of another program.
-pub(in crate::app) const WAITED_AFTER: Duration = Duration::from_mins(5);
+pub(in crate::app) const WAITING_ALERT_AFTER: Duration = Duration::from_mins(5);
 /// Minimum progress that ends waiting, metres.
 const PROGRESS_MIN_M: f64 = 0.1;
 /// Offset between a robot's clock and the server's from which the robot's counts as wrong,
@@ -36,7 +36,7 @@ const CLOCK_RIGHT_MS: u64 = 5_000;
 /// look like a clock that is behind.
 const CLOCK_WRONG_FOR: Duration = Duration::from_secs(30);
 /// Minimum interval between two checks.
-const LOOK_EVERY: Duration = Duration::from_secs(1);
+const CHECK_EVERY: Duration = Duration::from_secs(1);
 
 /// What is remembered of a robot.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -61,7 +61,7 @@ impl Memory {
                 if progress.id == mission && progress.driven_m < driven_m + PROGRESS_MIN_M =>
             {
                 let waited = now.saturating_sub(since);
-                self.is_waiting |= waited >= WAITED_AFTER;
+                self.is_waiting |= waited >= WAITING_ALERT_AFTER;
             }
             (Some(progress), before) => {
                 // The first look after a restart of the server ends nothing.
@@ -96,7 +96,7 @@ impl Conditions {
     /// The database failed; the next check repeats this one.
     pub(super) async fn check(&mut self, app: &App) -> Result<(), AppError> {
         let now = app.clock().elapsed();
-        let is_early = |looked_at: Duration| now.saturating_sub(looked_at) < LOOK_EVERY;
+        let is_early = |looked_at: Duration| now.saturating_sub(looked_at) < CHECK_EVERY;
         if self.looked_at.is_some_and(is_early) {
             return Ok(());
         }
@@ -111,7 +111,7 @@ impl Conditions {
             if (judged.is_waiting, judged.is_clock_wrong)
                 != (memory.is_waiting, memory.is_clock_wrong)
             {
-                write_down(app, &key, (*memory, judged), shown).await?;
+                store_transition(app, &key, (*memory, judged), shown).await?;
             }
             *memory = judged;
         }
@@ -147,7 +147,7 @@ impl Conditions {
                 mission: None,
                 clock_offset_ms: 0,
             };
-            write_down(app, key, (*memory, judged), shown).await?;
+            store_transition(app, key, (*memory, judged), shown).await?;
             *memory = judged;
         }
         Ok(())
@@ -179,7 +179,7 @@ async fn raised(app: &App) -> Result<HashMap<RobotKey, Memory>, AppError> {
     Ok(keys.map(|key| (key.clone(), memory(key))).collect())
 }
 
-async fn write_down(
+async fn store_transition(
     app: &App,
     (site, robot): &RobotKey,
     (before, after): (Memory, Memory),
@@ -222,7 +222,7 @@ async fn write_down(
 }
 
 fn waiting_text(shown: ReportedCondition) -> String {
-    let minutes = WAITED_AFTER.as_secs() / 60;
+    let minutes = WAITING_ALERT_AFTER.as_secs() / 60;
     let how = match shown.mission {
         Some(progress) if progress.paused => "it is paused",
         Some(_) | None => "it is not paused: look what holds the robot",

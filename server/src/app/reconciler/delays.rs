@@ -12,7 +12,7 @@ use tread_api::ids::MissionId;
 use tread_api::mission::MissionState;
 use tread_api::robot::{LinkState, RobotMode, Severity};
 
-use super::conditions::WAITED_AFTER;
+use super::conditions::WAITING_ALERT_AFTER;
 use crate::app::own_alert::OwnAlert;
 use crate::app::presence::{Presence, RobotKey};
 use crate::app::{App, AppError};
@@ -22,7 +22,7 @@ use crate::db::missions::OpenMission;
 /// Code of the alert about a mission that is next and does not begin.
 pub(in crate::app) const MISSION_WAITING_ALERT: &str = "mission-waiting";
 
-/// What is remembered of a robot whose next mission has not begun.
+/// State of a robot whose next mission has not begun.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct DelayedRobot {
     /// The mission with the time since which it is the next; `None` until the first check after a
@@ -57,7 +57,7 @@ impl DelayedRobot {
 
     fn is_late(self, now: Duration) -> bool {
         let waited = |(_, since): (MissionId, Duration)| now.saturating_sub(since);
-        self.next.map(waited) >= Some(WAITED_AFTER)
+        self.next.map(waited) >= Some(WAITING_ALERT_AFTER)
     }
 }
 
@@ -82,7 +82,7 @@ impl Delays {
         for mission in open.iter().filter(|mission| is_next(mission)) {
             let key = (mission.site.clone(), mission.robot.clone());
             // A robot that was revoked gets no mission, and nobody waits for it.
-            if !app.enrolment_registry().may_speak(&key) {
+            if !app.enrolment_registry().may_send(&key) {
                 continue;
             }
             let before = robots.get(&key).copied();
@@ -93,10 +93,10 @@ impl Delays {
             let mut seen = before.unwrap_or(fresh).seen(mission.id, now);
             let was_raised = before.is_some_and(|before| before.is_raised);
             if was_raised && !seen.is_raised {
-                write_down(app, &key, None).await?;
+                store_transition(app, &key, None).await?;
             }
             if !seen.is_raised && seen.is_late(now) {
-                write_down(app, &key, Some(mission)).await?;
+                store_transition(app, &key, Some(mission)).await?;
                 seen.is_raised = true;
             }
             robots.insert(key.clone(), seen);
@@ -109,7 +109,7 @@ impl Delays {
             .collect();
         for key in over {
             if robots.get(&key).is_some_and(|known| known.is_raised) {
-                write_down(app, &key, None).await?;
+                store_transition(app, &key, None).await?;
             }
             robots.remove(&key);
         }
@@ -132,7 +132,7 @@ async fn raised(app: &App) -> Result<HashMap<RobotKey, DelayedRobot>, AppError> 
 }
 
 /// Raises the alert about a mission, or clears that of a robot.
-async fn write_down(
+async fn store_transition(
     app: &App,
     key: &RobotKey,
     mission: Option<&OpenMission>,
@@ -160,7 +160,7 @@ async fn write_down(
 }
 
 fn waiting_text(app: &App, key: &RobotKey, mission: &OpenMission) -> String {
-    let minutes = WAITED_AFTER.as_secs() / 60;
+    let minutes = WAITING_ALERT_AFTER.as_secs() / 60;
     let presence = app.presences().get(key);
     let delay_cause = delay_cause(&presence, presence.link(app.clock().elapsed()));
     format!(

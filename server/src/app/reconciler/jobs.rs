@@ -86,7 +86,7 @@ fn last_progress(app: &App, mission: &OpenMission) -> Option<MissionProgress> {
         .presences()
         .get(&key_of(mission))
         .progress_of(mission.id);
-    progress.filter(|said| (said.revision, said.plan_hash) == mission.content)
+    progress.filter(|progress| (progress.revision, progress.plan_hash) == mission.content)
 }
 
 fn key_of(mission: &OpenMission) -> RobotKey {

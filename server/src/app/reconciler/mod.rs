@@ -47,14 +47,16 @@ use crate::db::restorations::RestrictedRobot;
 
 /// Interval between passes when nothing wakes it.
 pub const PERIOD: Duration = Duration::from_millis(500);
-/// Minimum interval between two looks at what is not a step of a mission: definitions of sites,
-/// attendance, expiry. With them in each pass, a new mission would wait for them.
+/// Minimum interval of the periodic checks, which are no steps of missions: definitions of sites,
+/// attendance, expiry. If each pass ran them, they would delay the offer of a new mission.
 const UPKEEP_EVERY: Duration = Duration::from_millis(100);
-/// Duration of reading all open missions from which reports of robots count as delayed by the database.
+/// If reading all open missions takes longer than this, a delay of the robots' reports is attributed to the
+/// database.
 const ANSWER_DELAY: Duration = Duration::from_millis(500);
-/// Maximum time for which delays that follow each other excuse robots: every mission ends.
+/// Maximum total time for which consecutive delays of the database excuse robots. It is bounded so that
+/// every mission ends.
 const EXCUSED_MAX: Duration = Duration::from_mins(1);
-/// Time since which a database answers that has not answered yet.
+/// Value of [`Reconciler::answering_since`] while no read of the database has succeeded.
 const NEVER: Duration = Duration::MAX;
 /// Maximum number of commands under way at once.
 const COMMANDS_MAX: usize = 64;
@@ -136,9 +138,9 @@ pub struct Reconciler {
     delays: Delays,
     /// Robots that are restricted since a restoration, as read last.
     restricted: HashMap<RobotKey, RestrictedRobot>,
-    /// Since when each of those that are to say how their missions ended is heard, and how often it
-    /// was asked.
-    asked: HashMap<RobotKey, (Duration, u32)>,
+    /// Of each robot that gets outcome queries: since when it is online, and the number of queries
+    /// that it was sent.
+    outcome_queries: HashMap<RobotKey, (Duration, u32)>,
     /// Time since which the database answers without delay.
     answering_since: Duration,
     /// Time of the first delay of those that have followed each other.
@@ -166,7 +168,7 @@ impl Reconciler {
             conditions: Conditions::default(),
             delays: Delays::default(),
             restricted: HashMap::new(),
-            asked: HashMap::new(),
+            outcome_queries: HashMap::new(),
             answering_since: Duration::ZERO,
             delayed_since: None,
             checks_due: Duration::ZERO,
@@ -355,8 +357,8 @@ impl Reconciler {
             let presence = self.app.presences().get(&key);
             let job = Job::Stop(stop.id);
             // Any sign of the agent suffices, even if its control loop has stopped.
-            let is_there = presence.is_there(self.app.clock().elapsed());
-            if is_there && self.is_due(&job) {
+            let is_connected = presence.is_connected(self.app.clock().elapsed());
+            if is_connected && self.is_due(&job) {
                 let app = self.app.clone();
                 self.start(job, stop_again(app, stop));
             }

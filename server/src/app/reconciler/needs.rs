@@ -111,8 +111,8 @@ pub(super) fn is_heard(presence: &Presence, now: Duration) -> bool {
 
 /// Returns the progress of a mission that its robot shows; `None` if it shows another or none.
 pub(super) fn driven(mission: &OpenMission, presence: &Presence) -> Option<MissionProgress> {
-    let said = presence.state().and_then(|state| state.mission);
-    said.filter(|driven| driven.id == mission.id)
+    let progress = presence.state().and_then(|state| state.mission);
+    progress.filter(|driven| driven.id == mission.id)
 }
 
 /// Returns whether a robot is heard without a mission that it had accepted, and with an empty
@@ -152,7 +152,7 @@ pub(super) fn is_held_otherwise(mission: &OpenMission, presence: &Presence) -> b
         | MissionState::Rejected
         | MissionState::Expired => return false,
     };
-    driven(mission, presence).is_some_and(|said| said.paused != here)
+    driven(mission, presence).is_some_and(|progress| progress.paused != here)
 }
 
 /// Decides what a mission needs, from its state and its robot's last state.
@@ -167,14 +167,14 @@ pub(super) fn decide(mission: &OpenMission, presence: &Presence, memory: Memory,
             Need::Wait
         };
     }
-    let said = driven(mission, presence);
+    let progress = driven(mission, presence);
     let longer_than = |grace: Duration| move |since: Duration| now.time_since(since) > grace;
     let ended_there = memory.ended_since.is_some_and(longer_than(RESTART_GRACE));
     let forgotten = memory.absent_since.is_some_and(longer_than(FORGET_GRACE));
-    let restarted = is_lost_by_restart(mission, presence, said.is_some(), now);
+    let restarted = is_lost_by_restart(mission, presence, progress.is_some(), now);
     match mission.state {
         MissionState::Queued | MissionState::Offered if heard => {
-            if mission.state == MissionState::Offered && said.is_some_and(of_present(mission)) {
+            if mission.state == MissionState::Offered && progress.is_some_and(of_present(mission)) {
                 Need::Apply(Change::Accept)
             } else if ended_there {
                 Need::Apply(Change::Forget)
@@ -192,7 +192,7 @@ pub(super) fn decide(mission: &OpenMission, presence: &Presence, memory: Memory,
         }
         MissionState::Active | MissionState::Paused => {
             let differs = memory.differs_from.is_some_and(longer_than(HOLD_GRACE));
-            let need = in_progress(mission, said, differs);
+            let need = in_progress(mission, progress, differs);
             // A stop or a teleoperation is recorded with the wish to hold the mission.
             if need == Need::Resume && presence.is_operator_controlled() {
                 Need::Wait
@@ -213,13 +213,13 @@ pub(super) fn decide(mission: &OpenMission, presence: &Presence, memory: Memory,
 
 fn of_present(mission: &OpenMission) -> impl Fn(MissionProgress) -> bool {
     let content = mission.content;
-    move |said| (said.revision, said.plan_hash) == content
+    move |progress| (progress.revision, progress.plan_hash) == content
 }
 
 /// Decides what a mission needs that its robot drives or holds; `differs` when the robot has shown
 /// it as paused for [`HOLD_GRACE`] while it is active here, or the reverse.
-fn in_progress(mission: &OpenMission, said: Option<MissionProgress>, differs: bool) -> Need {
-    let content = said.map(|said| (said.revision, said.plan_hash));
+fn in_progress(mission: &OpenMission, progress: Option<MissionProgress>, differs: bool) -> Need {
+    let content = progress.map(|progress| (progress.revision, progress.plan_hash));
     if mission.replacement.is_some() {
         return if content == mission.replacement {
             Need::Adopt
@@ -239,7 +239,7 @@ fn in_progress(mission: &OpenMission, said: Option<MissionProgress>, differs: bo
         // The robot paused it because of a stop or a teleoperation: only a person resumes it. The
         // robot's report of the pause sets what is wanted here accordingly; its state does if the report
         // is slow, or was of an earlier revision.
-        (false, false) if said.is_some_and(|said| said.is_paused_for_safety()) => {
+        (false, false) if progress.is_some_and(|progress| progress.is_paused_for_safety()) => {
             if differs {
                 Need::Apply(Change::Pause)
             } else {
@@ -254,15 +254,17 @@ fn in_progress(mission: &OpenMission, said: Option<MissionProgress>, differs: bo
 }
 
 /// Returns the time for which a robot may be unheard before its mission counts as lost, seconds.
-pub(super) fn lost_after_s(mission: &OpenMission, said: Option<MissionProgress>) -> f64 {
+pub(super) fn lost_after_s(mission: &OpenMission, progress: Option<MissionProgress>) -> f64 {
     match (mission.lost_after_s, mission.link_policy) {
         (Some(lost_after_s), _) => lost_after_s,
         (None, LinkPolicy::StopAfter { silence_s }) => silence_s + LOST_STOPPED_MARGIN_S,
         (None, LinkPolicy::Continue) => match mission.duration_s {
             Some(duration_s) => {
-                let left = said.filter(|said| said.length_m > 0.0).map_or(1.0, |said| {
-                    (1.0 - said.driven_m / said.length_m).clamp(0.0, 1.0)
-                });
+                let left = progress
+                    .filter(|progress| progress.length_m > 0.0)
+                    .map_or(1.0, |progress| {
+                        (1.0 - progress.driven_m / progress.length_m).clamp(0.0, 1.0)
+                    });
                 duration_s * left + LOST_MARGIN_S
             }
             None => LOST_UNPLANNED_S,

@@ -24,7 +24,8 @@ const REPORTED: &str = "the robot had ended it before this server was restored f
 const FORGOTTEN: &str = "this server was restored from a backup, and the robot no longer remembers \
                          whether it drove this mission: send it again if it did not";
 
-/// Asks a robot, and stores its answer. The last attempt gives up without one.
+/// Queries a robot for the outcomes of its missions and stores the answer. If the last attempt gets no
+/// answer, the queries end.
 pub(super) async fn ask(
     app: App,
     robot: RestrictedRobot,

@@ -21,11 +21,11 @@ use crate::db::restorations::RestrictedRobot;
 
 /// Maximum number of missions that expire in one pass.
 const EXPIRE_MAX: u32 = 1_000;
-/// Number of attempts to ask a robot how its missions ended, at most [`super::RETRY_MAX`] apart: an agent
-/// that does not know the question never answers.
+/// Maximum number of outcome queries to a robot, at most [`super::RETRY_MAX`] apart. An agent of an older
+/// release does not know the query and never answers.
 const OUTCOMES_TRIES_MAX: u32 = 6;
-/// Time for which a robot is given to upload its reports before it is asked how its missions ended:
-/// they say more.
+/// Time that a robot has to upload its reports before it gets an outcome query: reports contain more
+/// than the answer to the query.
 const OUTBOX_PATIENCE: Duration = Duration::from_secs(10);
 
 impl Reconciler {
@@ -52,7 +52,7 @@ impl Reconciler {
         let mut tx = self.app.db().read("reconciler").await?;
         let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
-        let wanted: HashMap<SiteId, (u64, u64)> = sites
+        let revisions: HashMap<SiteId, (u64, u64)> = sites
             .into_iter()
             .map(|row| {
                 let (terrains, fence) = (row.site.terrain_revision, row.site.geofence_revision);
@@ -61,7 +61,7 @@ impl Reconciler {
             .collect();
         for (key, held) in self.app.presences().online(self.app.clock().elapsed()) {
             // A robot without any definition of its site sends a hello and gets one.
-            let lags = wanted.get(&key.0).is_some_and(|&(terrains, fence)| {
+            let lags = revisions.get(&key.0).is_some_and(|&(terrains, fence)| {
                 held.terrains.is_some_and(|held| held != terrains)
                     // A robot without support for geofences reports no revision.
                     || held.fence.is_some_and(|held| held != fence)
@@ -77,16 +77,16 @@ impl Reconciler {
         Ok(())
     }
 
-    /// Asks robots that are restricted since a restoration how their missions ended.
+    /// Sends outcome queries to the robots that await their release after a restoration.
     fn query_restricted_robots(&mut self) {
         let restricted: Vec<RestrictedRobot> = self.restricted.values().cloned().collect();
-        let wanted = |key: &RobotKey| {
+        let needs_outcomes = |key: &RobotKey| {
             let found = self.restricted.get(key);
             found.is_some_and(|found| found.outcomes_wanted)
         };
-        self.asked.retain(|key, _| wanted(key));
+        self.outcome_queries.retain(|key, _| needs_outcomes(key));
         self.retries
-            .retain(|job, _| !matches!(job, Job::Outcomes(key) if !wanted(key)));
+            .retain(|job, _| !matches!(job, Job::Outcomes(key) if !needs_outcomes(key)));
         let now = self.app.clock().elapsed();
         for robot in restricted.into_iter().filter(|it| it.outcomes_wanted) {
             let key = key_of(&robot);
@@ -95,11 +95,11 @@ impl Reconciler {
                 continue;
             }
             let pending = presence.state().map_or(0, |state| state.outbox.pending);
-            let (since, tries) = *self.asked.entry(key.clone()).or_insert((now, 0));
+            let (since, tries) = *self.outcome_queries.entry(key.clone()).or_insert((now, 0));
             let is_patient = pending > 0 && now.saturating_sub(since) < OUTBOX_PATIENCE;
             let job = Job::Outcomes(key.clone());
             if !is_patient && self.is_due(&job) {
-                self.asked.insert(key, (since, tries + 1));
+                self.outcome_queries.insert(key, (since, tries + 1));
                 let is_last = tries + 1 >= OUTCOMES_TRIES_MAX;
                 let app = self.app.clone();
                 self.start(job, outcomes::ask(app, robot, is_last));

@@ -130,7 +130,7 @@ impl App {
                 StopDecision::Send => {
                     // A robot that is on the network gets the stop, and an alert if it does not
                     // confirm.
-                    if !is_alerted && !presence.is_there(self.clock().elapsed()) {
+                    if !is_alerted && !presence.is_connected(self.clock().elapsed()) {
                         actions.alerts.push(key);
                     }
                     actions.again.push(stop);

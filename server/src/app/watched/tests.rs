@@ -43,9 +43,9 @@ impl Fleet {
         while self.now < end {
             let (due, _) = self
                 .watched
-                .due(|_| Some(self.boot), self.now, ASKED_AT_ONCE_MAX);
+                .due(|_| Some(self.boot), self.now, REQUESTS_AT_ONCE_MAX);
             for asked in due {
-                self.watched.asked(&asked, self.answer, self.now);
+                self.watched.record_outcome(&asked, self.answer, self.now);
                 *self.asked.entry(asked.0).or_default() += 1;
             }
             self.now += STEP;
@@ -61,11 +61,11 @@ impl Fleet {
 fn several_watchers_of_a_robot_cost_one_request_and_others_none() {
     let mut fleet = Fleet::new(Outcome::Done);
     let watchers: Vec<Watch> = (0..40).map(|_| fleet.watched.begin(key(1))).collect();
-    fleet.pass(10 * ASK_PERIOD);
+    fleet.pass(10 * REQUEST_PERIOD);
     assert_eq!((fleet.asked(1), fleet.asked(2)), (10, 0));
     assert_eq!(fleet.watched.count(), 1);
     drop(watchers);
-    fleet.pass(10 * ASK_PERIOD);
+    fleet.pass(10 * REQUEST_PERIOD);
     assert_eq!(fleet.asked(1), 10, "nobody watches it any more");
     assert_eq!(fleet.watched.count(), 0);
     assert!(fleet.watched.lock().is_empty());
@@ -73,8 +73,8 @@ fn several_watchers_of_a_robot_cost_one_request_and_others_none() {
 
 #[test]
 fn a_request_outlasts_two_that_are_lost() {
-    assert!(ASK_FOR > 3 * ASK_PERIOD);
-    let for_ms = u64::try_from(ASK_FOR.as_millis()).unwrap();
+    assert!(REQUEST_DURATION > 3 * REQUEST_PERIOD);
+    let for_ms = u64::try_from(REQUEST_DURATION.as_millis()).unwrap();
     assert!(for_ms <= tread_api::wire::state::STATE_RATE_FOR_MAX_MS);
 }
 
@@ -83,16 +83,16 @@ fn a_run_that_never_answers_is_left_alone_also_when_it_is_watched_again_and_agai
     let mut fleet = Fleet::new(Outcome::NoAnswer);
     for _ in 0..100 {
         let watch = fleet.watched.begin(key(1));
-        fleet.pass(ASK_PERIOD);
+        fleet.pass(REQUEST_PERIOD);
         drop(watch);
-        fleet.pass(ASK_PERIOD);
+        fleet.pass(REQUEST_PERIOD);
     }
     assert_eq!(fleet.asked(1), TRIES_MAX as usize);
     let _watch = fleet.watched.begin(key(1));
     // Another run may be of a newer release.
     fleet.boot = boot(2);
     fleet.answer = Outcome::Done;
-    fleet.pass(2 * ASK_PERIOD);
+    fleet.pass(2 * REQUEST_PERIOD);
     assert_eq!(fleet.asked(1), TRIES_MAX as usize + 2);
 }
 
@@ -100,9 +100,9 @@ fn a_run_that_never_answers_is_left_alone_also_when_it_is_watched_again_and_agai
 fn a_run_that_has_answered_is_asked_on_after_an_outage() {
     let mut fleet = Fleet::new(Outcome::Done);
     let _watch = fleet.watched.begin(key(1));
-    fleet.pass(ASK_PERIOD);
+    fleet.pass(REQUEST_PERIOD);
     fleet.answer = Outcome::NoAnswer;
-    fleet.pass(10 * ASK_PERIOD);
+    fleet.pass(10 * REQUEST_PERIOD);
     assert_eq!(fleet.asked(1), 11);
 }
 
@@ -110,9 +110,9 @@ fn a_run_that_has_answered_is_asked_on_after_an_outage() {
 fn a_refusal_is_final_for_a_while() {
     let mut fleet = Fleet::new(Outcome::Refused);
     let _watch = fleet.watched.begin(key(1));
-    fleet.pass(REST);
+    fleet.pass(REQUEST_PAUSE);
     assert_eq!(fleet.asked(1), 1);
-    fleet.pass(ASK_PERIOD);
+    fleet.pass(REQUEST_PERIOD);
     assert_eq!(fleet.asked(1), 2);
 }
 
@@ -120,7 +120,7 @@ fn a_refusal_is_final_for_a_while() {
 fn robots_that_are_not_online_are_not_asked() {
     let watched = Watched::default();
     let _watch = watched.begin(key(1));
-    let (due, has_more) = watched.due(|_| None, Duration::from_secs(1), ASKED_AT_ONCE_MAX);
+    let (due, has_more) = watched.due(|_| None, Duration::from_secs(1), REQUESTS_AT_ONCE_MAX);
     assert!(due.is_empty() && !has_more);
 }
 
@@ -130,23 +130,23 @@ fn five_hundred_watched_robots_are_asked_in_turn_and_never_too_many_at_once() {
     let watchers: Vec<Watch> = (0..500).map(|number| watched.begin(key(number))).collect();
     let now = Duration::from_secs(1);
     let online = |_: &RobotKey| Some(boot(1));
-    let (first, has_more) = watched.due(online, now, ASKED_AT_ONCE_MAX);
-    assert_eq!((first.len(), has_more), (ASKED_AT_ONCE_MAX, true));
+    let (first, has_more) = watched.due(online, now, REQUESTS_AT_ONCE_MAX);
+    assert_eq!((first.len(), has_more), (REQUESTS_AT_ONCE_MAX, true));
     // While these are under way there is no room for others.
     assert_eq!(watched.due(online, now, 0), (Vec::new(), true));
     let mut asked: BTreeMap<RobotKey, usize> = BTreeMap::new();
     let mut under_way = first;
     while !under_way.is_empty() {
         for one in under_way {
-            watched.asked(&one, Outcome::Done, now);
+            watched.record_outcome(&one, Outcome::Done, now);
             *asked.entry(one.0).or_default() += 1;
         }
-        under_way = watched.due(online, now, ASKED_AT_ONCE_MAX).0;
+        under_way = watched.due(online, now, REQUESTS_AT_ONCE_MAX).0;
     }
     assert_eq!(asked.len(), 500);
     assert!(asked.values().all(|&times| times == 1), "{asked:?}");
     drop(watchers);
-    watched.due(online, now + ASK_PERIOD, ASKED_AT_ONCE_MAX);
+    watched.due(online, now + REQUEST_PERIOD, REQUESTS_AT_ONCE_MAX);
     assert!(watched.lock().is_empty());
 }
 
@@ -157,12 +157,12 @@ fn what_is_remembered_of_robots_that_nobody_watches_is_bounded() {
     let online = |_: &RobotKey| Some(boot(1));
     for number in 0..REMEMBERED_MAX + 100 {
         let watch = watched.begin(key(number));
-        let (due, _) = watched.due(online, now, ASKED_AT_ONCE_MAX);
+        let (due, _) = watched.due(online, now, REQUESTS_AT_ONCE_MAX);
         for asked in due {
-            watched.asked(&asked, Outcome::Refused, now);
+            watched.record_outcome(&asked, Outcome::Refused, now);
         }
         drop(watch);
     }
-    watched.due(online, now, ASKED_AT_ONCE_MAX);
+    watched.due(online, now, REQUESTS_AT_ONCE_MAX);
     assert_eq!(watched.lock().len(), REMEMBERED_MAX);
 }

@@ -48,7 +48,7 @@ pub const AGE_MAX: SignedDuration = SignedDuration::from_hours(24);
 pub const RETRY_MIN: Duration = Duration::from_secs(10);
 /// Maximum back-off.
 pub const RETRY_MAX: Duration = Duration::from_hours(2);
-/// Time for which a webhook rests after an attempt that failed, whatever else waits for it.
+/// Minimum time between a failed attempt and the next attempt for the same webhook, of any delivery.
 pub const REST_AFTER_FAILURE: Duration = Duration::from_secs(5);
 
 /// Origin of a delivery.
@@ -129,7 +129,8 @@ impl Dispatcher {
         }
     }
 
-    /// Stores outcomes, gives up what is too old, and starts what is due.
+    /// Stores the outcomes of attempts, abandons deliveries that are too old, and starts those that are
+    /// due.
     async fn pass(&mut self) -> Result<(), AppError> {
         let now = self.app.clock().elapsed();
         self.resting.retain(|_, until| *until > now);
@@ -207,7 +208,7 @@ impl Dispatcher {
             // There is room for every attempt that is under way, unless the server stops.
             let _ = finished.try_send(done);
         };
-        self.app.pass_by("webhook", attempt);
+        self.app.spawn_background("webhook", attempt);
     }
 
     /// Notes how an attempt ended.

@@ -44,7 +44,7 @@ const BUFFER_BYTES: usize = 4 * 1024;
 const REFUSED_CLOSE_MAX: Duration = Duration::from_millis(500);
 const REFUSED_BYTES_MAX: u64 = 16 * 1024;
 /// Number of bytes of a connection that are inspected first.
-const LOOKED_AT_BYTES: usize = 6;
+const INSPECTED_BYTES: usize = 6;
 /// What the log says of a robot whose certificate has expired.
 const EXPIRED: &str = "admit a robot whose certificate has expired (it renews it while it reaches the REST API; otherwise \
      compare its clock with this one, or let it join again by `tread-agent enroll`)";
@@ -116,7 +116,7 @@ impl Link {
             let (rate, clock) = (entry.byte_rate(), self.app.clock());
             let paused = |now| {
                 counters.gate_throttled.one();
-                if rate.is_to_be_logged(now) {
+                if rate.should_log(now) {
                     warn!(robot.id = %robot.1, "robot `{}` sends more than {BYTES_PER_S} bytes a second, and is read no faster", robot.1);
                 }
             };
@@ -150,7 +150,7 @@ impl Link {
     /// Authenticates the client; `None` if it is rejected.
     async fn authenticate_client(&self, stream: TcpStream) -> Option<Admitted> {
         let counters = self.app.counters();
-        let mut begin = [0; LOOKED_AT_BYTES];
+        let mut begin = [0; INSPECTED_BYTES];
         let first = tokio::time::timeout(FIRST_BYTE_TIMEOUT, stream.peek(&mut begin)).await;
         let Ok(Ok(length @ 1..)) = first else {
             counters.gate_silent.one();
@@ -269,8 +269,11 @@ impl Link {
         };
         if entry.take_over(init.session_id).await {
             let id = init.session_id;
-            let going = session_gone(&router, id);
-            if tokio::time::timeout(INSIDE_TIMEOUT, going).await.is_err() {
+            let session_end = session_gone(&router, id);
+            if tokio::time::timeout(INSIDE_TIMEOUT, session_end)
+                .await
+                .is_err()
+            {
                 warn!(robot.id = %robot.1, "the former session of robot `{}` did not end", robot.1);
             }
         }
@@ -393,9 +396,9 @@ async fn connect(router: &Router) -> anyhow::Result<TcpStream> {
 /// Waits until a router has closed a session whose link has ended.
 async fn session_gone(router: &Arc<Router>, session_id: u128) {
     loop {
-        let asked = Arc::clone(router);
-        let asking = tokio::task::spawn_blocking(move || asked.has_session(session_id));
-        if !asking.await.unwrap_or(false) {
+        let checked_router = Arc::clone(router);
+        let checking = tokio::task::spawn_blocking(move || checked_router.has_session(session_id));
+        if !checking.await.unwrap_or(false) {
             return;
         }
         tokio::time::sleep(SESSION_GONE_EVERY).await;

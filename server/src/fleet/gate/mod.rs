@@ -53,7 +53,7 @@ pub(super) use self::throttle::BYTE_RATE;
 use super::routers::Routers;
 use super::{FleetError, SEND_BUFFER_BYTES, SESSIONS_MAX, Security};
 use crate::app::App;
-use crate::authority::{PORT_LASTS, Trusted};
+use crate::authority::{PORT_CERTIFICATE_VALIDITY, Trusted};
 use crate::clock::Clock;
 use crate::connections::{ACCEPT_REST, Bounds, Connections};
 use crate::supervisor::Supervisor;
@@ -120,7 +120,7 @@ impl PortTrust {
         let age = now.duration_since(present.made_at);
         let trusted = self.security.authorities.present();
         let is_rotated = !Arc::ptr_eq(&trusted, &present.trusted);
-        if is_rotated || age > PORT_LASTS / 3 || age < SignedDuration::ZERO {
+        if is_rotated || age > PORT_CERTIFICATE_VALIDITY / 3 || age < SignedDuration::ZERO {
             match server_config(&trusted, &self.security.names, &self.clock) {
                 Ok(config) => {
                     *present = Present {

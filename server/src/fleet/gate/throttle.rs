@@ -63,7 +63,7 @@ impl ByteRate {
     }
 
     /// Returns whether a log entry about pauses is due.
-    pub(super) fn is_to_be_logged(&self, now: Duration) -> bool {
+    pub(super) fn should_log(&self, now: Duration) -> bool {
         let mut used = self.lock();
         let is_due = |at| now.saturating_sub(at) >= LOG_EVERY;
         let is_due = used.logged_at.is_none_or(is_due);
@@ -191,7 +191,7 @@ mod tests {
     fn pauses_are_logged_now_and_then() {
         let rate = ByteRate::new(SLOW);
         let at = Duration::from_secs;
-        let logged = [0, 1, 9, 10, 15, 20].map(|second| rate.is_to_be_logged(at(second)));
+        let logged = [0, 1, 9, 10, 15, 20].map(|second| rate.should_log(at(second)));
         assert_eq!(logged, [true, false, false, true, false, true]);
     }
 }

@@ -159,7 +159,7 @@ pub fn comma<T: 'static>(columns: &'static [Column], row: fn(&T) -> Row) -> Box<
     })
 }
 
-/// Returns an encoder of Parquet, with one row group for each chunk. `said` are the key–value
+/// Returns an encoder of Parquet, with one row group for each chunk. `metadata` are the key–value
 /// metadata of the file.
 ///
 /// # Errors
@@ -167,10 +167,10 @@ pub fn comma<T: 'static>(columns: &'static [Column], row: fn(&T) -> Row) -> Box<
 pub fn parquet<T: 'static>(
     columns: &'static [Column],
     row: fn(&T) -> Row,
-    said: Vec<(String, String)>,
+    metadata: Vec<(String, String)>,
 ) -> Result<Box<dyn Writer<T>>, TableError> {
     Ok(Box::new(Table {
-        rows: Parquet::new(columns, said)?,
+        rows: Parquet::new(columns, metadata)?,
         row,
         of: PhantomData,
     }))

@@ -21,17 +21,17 @@ pub(super) struct Parquet {
 impl Parquet {
     pub(super) fn new(
         columns: &'static [Column],
-        said: Vec<(String, String)>,
+        metadata: Vec<(String, String)>,
     ) -> Result<Self, TableError> {
         let schema = Arc::new(parse_message_type(&message(columns))?);
-        let said = said
+        let metadata = metadata
             .into_iter()
             .map(|(key, value)| KeyValue::new(key, value))
             .collect();
         let properties = WriterProperties::builder()
             .set_compression(Compression::SNAPPY)
             .set_created_by("tread".to_owned())
-            .set_key_value_metadata(Some(said))
+            .set_key_value_metadata(Some(metadata))
             .build();
         let file = SerializedFileWriter::new(Vec::new(), schema, Arc::new(properties))?;
         Ok(Self {

@@ -85,12 +85,12 @@ impl BlockCells {
         }
     }
 
-    /// Removes the sums for which `goes` is true.
-    fn remove(&mut self, goes: impl Fn(&PartKey) -> bool) {
+    /// Removes the sums for which `is_removed` is true.
+    fn remove(&mut self, is_removed: impl Fn(&PartKey) -> bool) {
         for parts in self.cells.values_mut() {
-            if parts.iter().any(|part| goes(&part.key)) {
+            if parts.iter().any(|part| is_removed(&part.key)) {
                 let before = parts.len();
-                let kept = parts.iter().filter(|part| !goes(&part.key));
+                let kept = parts.iter().filter(|part| !is_removed(&part.key));
                 *parts = kept.copied().collect();
                 self.parts -= before - parts.len();
             }
@@ -189,10 +189,10 @@ impl Blocks {
         Some(taken)
     }
 
-    pub(super) fn remove(&mut self, goes: impl Fn(&PartKey) -> bool) {
+    pub(super) fn remove(&mut self, is_removed: impl Fn(&PartKey) -> bool) {
         for cells in self.present.values_mut() {
             self.bytes -= cells.bytes();
-            cells.remove(&goes);
+            cells.remove(&is_removed);
             self.bytes += cells.bytes();
         }
     }

@@ -112,8 +112,8 @@ impl<'choice> Choice<'choice> {
         let ratio = |of: ConfigurationId| self.normalisation.and_then(|joined| joined.ratio(of));
         let reference = self.normalisation.map(|joined| joined.reference);
         match (self.configuration, reference) {
-            (Some(asked), _) if asked == found => Some((found, 1.0)),
-            (Some(asked), _) => Some((asked, ratio(found)? / ratio(asked)?)),
+            (Some(chosen), _) if chosen == found => Some((found, 1.0)),
+            (Some(chosen), _) => Some((chosen, ratio(found)? / ratio(chosen)?)),
             (None, Some(reference)) => {
                 Some(ratio(found).map_or((found, 1.0), |ratio| (reference, ratio)))
             }
@@ -160,7 +160,7 @@ pub struct Group<'map> {
 
 impl Group<'_> {
     /// Returns whether any pass has information.
-    fn tells(&self) -> bool {
+    fn has_information(&self) -> bool {
         !self.seen.is_empty()
     }
 }
@@ -315,9 +315,10 @@ impl SiteMap {
         let Some(&robot) = self.names.robots.numbers.get(robot) else {
             return;
         };
-        let goes = |key: &PartKey| key.robot == robot && hours.contains(i64::from(key.epoch_h));
-        self.blocks.remove(goes);
-        self.totals.retain(|key, _sums| !goes(key));
+        let is_withdrawn =
+            |key: &PartKey| key.robot == robot && hours.contains(i64::from(key.epoch_h));
+        self.blocks.remove(is_withdrawn);
+        self.totals.retain(|key, _sums| !is_withdrawn(key));
         self.count_segments();
         // A block may have been absent, or been read after the removal from the database.
         self.changes.record_all();
@@ -423,7 +424,10 @@ impl SiteMap {
                 None => group.uninformative_passes += sums.segments,
             }
         }
-        groups.into_values().filter(Group::tells).collect()
+        groups
+            .into_values()
+            .filter(Group::has_information)
+            .collect()
     }
 
     /// Returns whether measurements of this robot and configuration are chosen.
@@ -471,7 +475,7 @@ impl SiteMap {
                 None => groups[index].uninformative_passes += part.passes(),
             }
         }
-        groups.retain(Group::tells);
+        groups.retain(Group::has_information);
         groups.sort_unstable_by_key(|group| (group.terrain, group.configuration));
         groups
     }

@@ -86,7 +86,7 @@ pub struct CompiledFilter<'choice> {
 }
 
 impl CompiledFilter<'_> {
-    fn sees(&self, key: &PartKey, ground: u16) -> Option<f64> {
+    fn ratio_of(&self, key: &PartKey, ground: u16) -> Option<f64> {
         let is_here = self.grounds.get(key.terrain as usize) == Some(&ground);
         if !is_here {
             return None;
@@ -147,7 +147,7 @@ impl SiteMap {
         room.seen.clear();
         room.uninformative_passes = 0;
         for part in parts {
-            let Some(ratio) = filter.sees(&part.key, ground) else {
+            let Some(ratio) = filter.ratio_of(&part.key, ground) else {
                 continue;
             };
             let rank = self.names.robots.rank(part.key.robot);
@@ -233,7 +233,7 @@ impl Cells<'_> {
         let mut sums: std::collections::BTreeMap<PartKey, Sums> = std::collections::BTreeMap::new();
         for cell in self.cells_in(area, None) {
             for part in &*self.parts_at(cell, filter.when) {
-                if filter.sees(&part.key, ground).is_some() {
+                if filter.ratio_of(&part.key, ground).is_some() {
                     let added = part.sums();
                     let entry = sums.entry(part.key);
                     entry.and_modify(|sums| sums.add(&added)).or_insert(added);

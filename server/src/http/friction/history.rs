@@ -11,7 +11,7 @@ use tread_api::ids::{ConfigurationId, SiteId, TerrainId};
 use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::IntoParams;
 
-use super::asked;
+use super::parameters;
 use crate::app::App;
 use crate::app::friction::Times;
 use crate::http::etag;
@@ -68,8 +68,8 @@ pub(in crate::http) async fn terrain_history(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let times = times(query.from, query.to, query.step_s)?;
-    let asked = asked(None, query.configuration, query.normalisation);
-    let found = app.history_of_terrain((&site, &terrain), &asked, times);
+    let parameters = parameters(None, query.configuration, query.normalisation);
+    let found = app.history_of_terrain((&site, &terrain), &parameters, times);
     Ok(etag::json(&headers, &found.await?))
 }
 
@@ -107,11 +107,11 @@ pub(in crate::http) async fn point_history(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let times = times(query.from, query.to, query.step_s)?;
-    let asked = asked(None, query.configuration, query.normalisation);
+    let parameters = parameters(None, query.configuration, query.normalisation);
     let point = Point {
         x_m: query.x_m,
         y_m: query.y_m,
     };
-    let found = app.history_of_point(&site, &asked, point, times);
+    let found = app.history_of_point(&site, &parameters, point, times);
     Ok(etag::json(&headers, &found.await?))
 }

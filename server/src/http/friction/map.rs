@@ -15,7 +15,7 @@ use utoipa::IntoParams;
 
 use super::streamed::{CSV_MEDIA_TYPE, JSON_MEDIA_TYPE, PARQUET_MEDIA_TYPE, streamed};
 use crate::app::friction::{
-    Area, AreaBounds, CellExport, Picture, PictureAsked, ReadingParameters,
+    Area, AreaBounds, CellExport, Picture, PictureRequest, ReadingParameters,
 };
 use crate::app::{App, AppError};
 use crate::formats::nav2::{self, SpeedScale};
@@ -147,7 +147,7 @@ fn within(
 }
 
 impl MapQuery {
-    fn asked(&self) -> Result<PictureAsked, Problem> {
+    fn request(&self) -> Result<PictureRequest, Problem> {
         let bounds = AreaBounds {
             x_min_m: self.x_min_m,
             y_min_m: self.y_min_m,
@@ -159,8 +159,8 @@ impl MapQuery {
         } else {
             Some(Area::new(bounds)?)
         };
-        Ok(PictureAsked {
-            asked: ReadingParameters {
+        Ok(PictureRequest {
+            parameters: ReadingParameters {
                 as_of: self.as_of,
                 configuration: self.configuration,
                 normalisation: self.normalisation.clone(),
@@ -256,13 +256,14 @@ pub(in crate::http) async fn map(
     match format {
         Format::Picture(format) => {
             let (name, write) = writer(format, &query)?;
-            let picture = app.picture(&site, query.asked()?, name, write).await?;
+            let picture = app.picture(&site, query.request()?, name, write).await?;
             Ok(answer(&headers, media_type, picture))
         }
         Format::List(format) => {
-            let asked = query.asked()?;
-            let writer_of = |site: &Site, as_of| list_writer(format, site, (&asked.asked, as_of));
-            let export = app.export_cells(&site, &asked, writer_of).await?;
+            let request = query.request()?;
+            let writer_of =
+                |site: &Site, as_of| list_writer(format, site, (&request.parameters, as_of));
+            let export = app.export_cells(&site, &request, writer_of).await?;
             let (state, as_of) = ((query.format, export.state()), export.as_of());
             let begun = streamed(media_type, export, CellExport::next);
             let response = etag::streamed(&headers, media_type, state, begun).await?;
@@ -274,21 +275,21 @@ pub(in crate::http) async fn map(
 fn list_writer(
     format: ListFormat,
     site: &Site,
-    (asked, as_of): (&ReadingParameters, Option<Timestamp>),
+    (parameters, as_of): (&ReadingParameters, Option<Timestamp>),
 ) -> Result<Box<dyn Writer<CellFriction>>, TableError> {
     Ok(match format {
         ListFormat::Json => json::page(as_of),
         ListFormat::GeoJson => json::features(site, as_of),
         ListFormat::Csv => table::comma(cells::COLUMNS, cells::row),
         ListFormat::Parquet => {
-            let mut said = vec![
+            let mut metadata = vec![
                 ("tread:site".to_owned(), site.id.to_string()),
                 ("tread:cell_m".to_owned(), site.grid.cell_m.to_string()),
             ];
-            let normalisation = asked.normalisation.clone();
-            said.extend(normalisation.map(|name| ("tread:normalisation".to_owned(), name)));
-            said.extend(as_of.map(|as_of| ("tread:as_of".to_owned(), as_of.to_string())));
-            table::parquet(cells::COLUMNS, cells::row, said)?
+            let normalisation = parameters.normalisation.clone();
+            metadata.extend(normalisation.map(|name| ("tread:normalisation".to_owned(), name)));
+            metadata.extend(as_of.map(|as_of| ("tread:as_of".to_owned(), as_of.to_string())));
+            table::parquet(cells::COLUMNS, cells::row, metadata)?
         }
     })
 }
@@ -305,20 +306,20 @@ pub(super) fn add_as_of_header(mut response: Response, as_of: Option<Timestamp>)
 fn answer(headers: &HeaderMap, media_type: &'static str, picture: Picture) -> Response {
     let of = picture.of;
     let mut response = etag::bytes(headers, media_type, Bytes::from_owner(picture.bytes));
-    let said = response.headers_mut();
+    let headers = response.headers_mut();
     // A cache must not return one format for another.
-    said.insert(axum::http::header::VARY, HeaderValue::from_static("accept"));
+    headers.insert(axum::http::header::VARY, HeaderValue::from_static("accept"));
     let as_of = Timestamp::from_microsecond(of.as_of_us).unwrap_or(Timestamp::MAX);
-    let mut say = |name: HeaderName, value: Option<String>| {
+    let mut set_header = |name: HeaderName, value: Option<String>| {
         if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
-            said.insert(name, value);
+            headers.insert(name, value);
         }
     };
-    say(AS_OF, Some(as_of.to_string()));
-    say(
+    set_header(AS_OF, Some(as_of.to_string()));
+    set_header(
         CONFIGURATION,
         of.configuration.map(|found| found.to_string()),
     );
-    say(NORMALISATION, of.normalisation.clone());
+    set_header(NORMALISATION, of.normalisation.clone());
     response
 }

@@ -50,11 +50,11 @@ pub(super) struct ReadingQuery {
     limit: Option<u32>,
 }
 
-/// What a question asks for besides the place.
+/// Returns the parameters that all queries of friction have in common.
 ///
-/// Each query has these fields of its own: they cannot be flattened into one, since numbers do not
-/// survive that.
-fn asked(
+/// Each query type repeats these fields: they cannot be a shared type with `#[serde(flatten)]`, which
+/// fails to parse numbers in query strings.
+fn parameters(
     as_of: Option<Timestamp>,
     configuration: Option<ConfigurationId>,
     normalisation: Option<String>,
@@ -79,10 +79,10 @@ pub(super) async fn terrains(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let limit = page_limit(query.limit)?;
-    let asked = asked(query.as_of, query.configuration, query.normalisation);
+    let parameters = parameters(query.as_of, query.configuration, query.normalisation);
     let cursor = query.cursor.as_deref();
     let found = app
-        .friction_of_terrains(&site, &asked, cursor, limit)
+        .friction_of_terrains(&site, &parameters, cursor, limit)
         .await?;
     let as_of = found.items.first().and_then(|terrain| terrain.as_of);
     Ok(add_as_of_header(etag::json(&headers, &found), as_of))
@@ -115,8 +115,10 @@ pub(super) async fn terrain(
     Query(query): Query<TerrainReadingQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let asked = asked(query.as_of, query.configuration, query.normalisation);
-    let found = app.friction_of_terrain(&site, &terrain, &asked).await?;
+    let parameters = parameters(query.as_of, query.configuration, query.normalisation);
+    let found = app
+        .friction_of_terrain(&site, &terrain, &parameters)
+        .await?;
     Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
@@ -213,8 +215,8 @@ pub(super) async fn segments(
         }
         SegmentFormat::Csv => table::comma(segments::COLUMNS, segments::row),
         SegmentFormat::Parquet => {
-            let said = vec![("tread:site".to_owned(), site.to_string())];
-            let writer = table::parquet(segments::COLUMNS, segments::row, said);
+            let metadata = vec![("tread:site".to_owned(), site.to_string())];
+            let writer = table::parquet(segments::COLUMNS, segments::row, metadata);
             writer.map_err(AppError::from)?
         }
     };

@@ -14,10 +14,10 @@ use tread_api::page::{DifferencePage, MapPage};
 use tread_api::problem::ProblemBody;
 use utoipa::IntoParams;
 
-use super::asked;
 use super::map::add_as_of_header;
+use super::parameters;
 use crate::app::App;
-use crate::app::friction::{Area, AreaBounds, CellsAsked};
+use crate::app::friction::{Area, AreaBounds, CellRequest};
 use crate::http::etag;
 use crate::http::extract::{Json, Path, Query, page_limit};
 use crate::http::problem::Problem;
@@ -65,8 +65,8 @@ pub(in crate::http) async fn cells(
     Query(query): Query<CellQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let asked = asked(query.as_of, query.configuration, query.normalisation);
-    let cells = CellsAsked {
+    let parameters = parameters(query.as_of, query.configuration, query.normalisation);
+    let cells = CellRequest {
         area: Area::new(AreaBounds {
             x_min_m: query.x_min_m,
             y_min_m: query.y_min_m,
@@ -77,7 +77,7 @@ pub(in crate::http) async fn cells(
         cursor: query.cursor.as_deref(),
         limit: page_limit(query.limit)?,
     };
-    let found = app.friction_of_cells(&site, &asked, cells).await?;
+    let found = app.friction_of_cells(&site, &parameters, cells).await?;
     Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
@@ -111,12 +111,12 @@ pub(in crate::http) async fn point(
     Query(query): Query<PointQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let asked = asked(query.as_of, query.configuration, query.normalisation);
+    let parameters = parameters(query.as_of, query.configuration, query.normalisation);
     let point = Point {
         x_m: query.x_m,
         y_m: query.y_m,
     };
-    let found = app.friction_at(&site, &asked, point).await?;
+    let found = app.friction_at(&site, &parameters, point).await?;
     Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
@@ -179,8 +179,8 @@ pub(in crate::http) async fn difference(
     Query(query): Query<DifferenceQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let asked = asked(None, query.configuration, query.normalisation);
-    let cells = CellsAsked {
+    let parameters = parameters(None, query.configuration, query.normalisation);
+    let cells = CellRequest {
         area: Area::new(AreaBounds {
             x_min_m: query.x_min_m,
             y_min_m: query.y_min_m,
@@ -192,7 +192,9 @@ pub(in crate::http) async fn difference(
         limit: page_limit(query.limit)?,
     };
     let times = (query.from, query.to);
-    let found = app.friction_difference(&site, &asked, times, cells).await?;
+    let found = app
+        .friction_difference(&site, &parameters, times, cells)
+        .await?;
     Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
@@ -232,7 +234,7 @@ pub(in crate::http) async fn visits(
     Query(query): Query<VisitQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let asked = asked(query.as_of, query.configuration, query.normalisation);
+    let parameters = parameters(query.as_of, query.configuration, query.normalisation);
     let area = Area::new(AreaBounds {
         x_min_m: Some(query.x_min_m),
         y_min_m: Some(query.y_min_m),
@@ -240,6 +242,8 @@ pub(in crate::http) async fn visits(
         y_max_m: Some(query.y_max_m),
     })?;
     let limit = page_limit(query.limit)?;
-    let found = app.visits_worth_most(&site, &asked, area, limit).await?;
+    let found = app
+        .visits_worth_most(&site, &parameters, area, limit)
+        .await?;
     Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }

@@ -60,6 +60,6 @@ pub(in crate::http) async fn list(
     responses((status = 200, body = AuditChain), (status = 404, body = ProblemBody)))]
 pub(in crate::http) async fn chain(State(app): State<App>) -> Result<Json<AuditChain>, Problem> {
     let chain = app.audit_chain().await?;
-    let gone = || Problem::new(ProblemType::NotFound).detail("the hash chain has no record");
-    Ok(Json(chain.ok_or_else(gone)?))
+    let no_record = || Problem::new(ProblemType::NotFound).detail("the hash chain has no record");
+    Ok(Json(chain.ok_or_else(no_record)?))
 }

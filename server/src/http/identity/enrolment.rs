@@ -193,15 +193,15 @@ fn audited(mut response: Response, what: Value) -> Response {
 /// Returns the response to a refused request for a certificate; counts the cause.
 fn refusal(app: &App, error: EnrolError) -> Response {
     let counters = app.counters();
-    let said = error.to_string();
+    let message = error.to_string();
     let counter = match error {
         EnrolError::Request(_) => {
-            let problem = Problem::new(ProblemType::InvalidBody).detail(said);
+            let problem = Problem::new(ProblemType::InvalidBody).detail(message);
             return problem.field("certificate_request").into_response();
         }
         EnrolError::Closed => return Problem::from(AppError::NoAuthority).into_response(),
         EnrolError::App(error) => return Problem::from(error).into_response(),
-        EnrolError::Locked(left) => return locked(app, left, said),
+        EnrolError::Locked(left) => return locked(app, left, message),
         EnrolError::Malformed => &counters.join_token_malformed,
         EnrolError::Unknown => &counters.join_token_unknown,
         EnrolError::Expired(_) => &counters.join_token_expired,

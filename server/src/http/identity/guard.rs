@@ -213,10 +213,10 @@ impl Guard {
         }
     }
 
-    fn record(&self, asked: AuditedRequest, response: &Response, who: Option<&Arc<Credential>>) {
-        let said = response.extensions().get::<Audited>();
-        let said = said.map(|Audited(what)| what.clone());
-        let left = asked.slot.left().cloned();
+    fn record(&self, audited: AuditedRequest, response: &Response, who: Option<&Arc<Credential>>) {
+        let recorded = response.extensions().get::<Audited>();
+        let recorded = recorded.map(|Audited(what)| what.clone());
+        let left = audited.slot.left().cloned();
         let entry = AuditEntry {
             id: 0,
             at: self.app.clock().now(),
@@ -226,13 +226,13 @@ impl Guard {
             token: who.and_then(|who| who.subject.token()),
             person: who.and_then(|who| who.person.clone()),
             role: who.and_then(|who| who.role),
-            address: asked.address.to_string(),
-            method: asked.method,
-            route: asked.route,
-            path: asked.path,
+            address: audited.address.to_string(),
+            method: audited.method,
+            route: audited.route,
+            path: audited.path,
             status: response.status().as_u16(),
-            request_id: asked.request_id,
-            what: said.or(left).filter(|what| !what.is_null()),
+            request_id: audited.request_id,
+            what: recorded.or(left).filter(|what| !what.is_null()),
             previous_hash: None,
             hash: None,
         };
@@ -250,7 +250,7 @@ struct AuditedRequest {
     slot: AuditSlot,
 }
 
-fn asked(request: &Request, route: &str) -> AuditedRequest {
+fn audited_request(request: &Request, route: &str) -> AuditedRequest {
     let short = |text: &str| text.chars().take(AUDIT_TEXT_MAX).collect();
     let request_id = request.headers().get(REQUEST_ID);
     AuditedRequest {
@@ -275,7 +275,7 @@ pub(in crate::http) async fn authorize(
 ) -> Response {
     let route = request.extensions().get::<MatchedPath>();
     let route = route.map(|route| route.as_str().to_owned());
-    let asked = asked(&request, route.as_deref().unwrap_or("none"));
+    let audited = audited_request(&request, route.as_deref().unwrap_or("none"));
     let admitted = match guard.check_form(&request) {
         Ok(()) => match &route {
             Some(route) => guard.admit(&mut request, route).await,
@@ -288,7 +288,7 @@ pub(in crate::http) async fn authorize(
         Ok(subject) => subject,
         Err(refusal) => {
             if refusal.is_audited {
-                guard.record(asked, &refusal.response, refusal.who.as_ref());
+                guard.record(audited, &refusal.response, refusal.who.as_ref());
             }
             return *refusal.response;
         }
@@ -296,7 +296,7 @@ pub(in crate::http) async fn authorize(
     let is_change = is_change(request.method());
     let cut = request.extensions().get::<Cut>().cloned();
     if is_change {
-        request.extensions_mut().insert(asked.slot.clone());
+        request.extensions_mut().insert(audited.slot.clone());
     }
     let response = next.run(request).await;
     if response.status() == StatusCode::FORBIDDEN && subject.is_some() {
@@ -308,7 +308,7 @@ pub(in crate::http) async fn authorize(
     if is_change || is_audited {
         let signed_in = response.extensions().get::<SignedIn>().cloned();
         let who = subject.clone().or(signed_in.map(|SignedIn(who)| who));
-        guard.record(asked, &response, who.as_ref());
+        guard.record(audited, &response, who.as_ref());
     }
     match subject {
         Some(subject) => end_with(&guard.app, subject, cut, response),
@@ -396,7 +396,7 @@ fn end_with(app: &App, subject: Arc<Credential>, cut: Option<Cut>, response: Res
     // A body is not polled while the client reads slowly, so a separate task watches.
     let given = CancellationToken::new();
     let guard = given.clone().drop_guard();
-    app.pass_by("download", async move {
+    app.spawn_background("download", async move {
         tokio::select! {
             () = given.cancelled() => {}
             () = over => {

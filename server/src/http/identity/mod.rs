@@ -1,9 +1,10 @@
-//! Who may ask for what.
+//! Authorisation of requests.
 //!
-//! One source: each route's `#[utoipa::path]` says `security(("token" = ["dispatch"]))`.
-//! [`access`] reads the table from the document, [`guard`] enforces it on whatever matched, and
-//! refuses what the document does not mention, and, by [`place`], what is about a site or robot that
-//! the token is not for. Handlers find who asks as a [`crate::http::subject::Subject`].
+//! The API description is the only source of the required rights: each route's `#[utoipa::path]`
+//! names one, such as `security(("token" = ["dispatch"]))`. [`access`] reads the rights from the
+//! description. [`guard`] checks each request against them and refuses routes that the description
+//! does not contain. [`place`] refuses sites and robots outside the token's scope. Handlers get the
+//! authenticated client as a [`crate::http::subject::Subject`].
 
 pub(super) mod access;
 pub(super) mod audit;

@@ -1,8 +1,8 @@
 //! `/v1/sign-in`: how people sign in, and the sign-in at an OpenID provider.
 //!
 //! `…/oidc` sends a browser to the provider and gives it a cookie; the provider sends it back to
-//! `…/oidc/callback`, which opens a session and sends it to the page. There is nothing in either
-//! address that says where a browser goes then.
+//! `…/oidc/callback`, which opens a session and redirects the browser to the page. Neither address has
+//! a parameter for the target of that redirect, so a link cannot redirect a browser elsewhere.
 
 use std::sync::Arc;
 
@@ -23,9 +23,9 @@ use crate::http::extract::{Json, Query};
 use crate::http::page;
 use crate::http::problem::Problem;
 use crate::identity::origin::Names;
-use crate::identity::pending::SIGN_IN_LASTS;
+use crate::identity::pending::SIGN_IN_TIMEOUT;
 
-/// Where a browser is sent that has signed in: the mark tells the page to ask who it is.
+/// Target of the redirect after a sign-in; the fragment makes the page request the session's user.
 const SIGNED_IN: &str = "/#signed-in";
 
 /// Get the available sign-in methods.
@@ -52,7 +52,7 @@ pub(in crate::http) async fn begin(
     };
     let mut response = see_other(&begun.location);
     if let Some(cookie) = &begun.cookie {
-        let (headers, lasts_s) = (response.headers_mut(), SIGN_IN_LASTS.as_secs());
+        let (headers, lasts_s) = (response.headers_mut(), SIGN_IN_TIMEOUT.as_secs());
         browser::set_sign_in_cookie(headers, names.is_tls, cookie, lasts_s);
     }
     response

@@ -13,7 +13,7 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tread_api::identity::Role;
 use tread_server::connections::BOUNDS;
-use tread_server::http::extract::{BODY_TIMEOUT, STRANGER_BODY_TIMEOUT};
+use tread_server::http::extract::{BODY_TIMEOUT, UNAUTHENTICATED_BODY_TIMEOUT};
 
 use crate::harness::{PATIENCE, Yard, client};
 use crate::robot::Robot;
@@ -196,7 +196,7 @@ async fn the_body_of_a_stranger_has_two_seconds() {
     assert!(said.starts_with("HTTP/1.1 408"), "{said}");
     let took = began_at.elapsed();
     assert!(
-        (STRANGER_BODY_TIMEOUT..BODY_TIMEOUT).contains(&took),
+        (UNAUTHENTICATED_BODY_TIMEOUT..BODY_TIMEOUT).contains(&took),
         "{took:?}"
     );
     yard.server.stop().await.unwrap();

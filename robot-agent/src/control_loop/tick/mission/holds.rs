@@ -14,8 +14,8 @@ use crate::control_loop::tick::STANDING;
 use crate::control_loop::tick::sensing::SensingOutput;
 use crate::safety::microseconds;
 
-/// Time for which a base that was silent must be heard before its mission goes on.
-const HEARD_AGAIN_FOR: Duration = Duration::from_millis(500);
+/// Time for which a base must send messages after a silence before its mission goes on.
+const BASE_RECOVERY_TIME: Duration = Duration::from_millis(500);
 /// Longest hold for sensors, after which the mission fails. A position finding that ends at
 /// standstill, after 10 s, leaves time for the mission to go on.
 const SENSORS_HOLD_MAX: Duration = Duration::from_secs(15);
@@ -64,14 +64,14 @@ impl MissionStage {
         }
     }
 
-    /// Holds the mission while the base is silent and for [`HEARD_AGAIN_FOR`] afterwards.
+    /// Holds the mission while the base is silent and for [`BASE_RECOVERY_TIME`] afterwards.
     pub(super) fn hold_for_base(&mut self, now: Duration, fault: Option<Fault>) {
         if fault == Some(Fault::BaseSilent) {
             self.base_silent_at = Some(now);
         }
         let is_on_hold = self
             .base_silent_at
-            .is_some_and(|silent_at| now.saturating_sub(silent_at) < HEARD_AGAIN_FOR);
+            .is_some_and(|silent_at| now.saturating_sub(silent_at) < BASE_RECOVERY_TIME);
         if !is_on_hold {
             self.base_silent_at = None;
         }

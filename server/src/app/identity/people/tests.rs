@@ -2,7 +2,7 @@ use std::io;
 
 use super::*;
 use crate::app::Dependencies;
-use crate::app::identity::SESSION_LASTS;
+use crate::app::identity::SESSION_LIFETIME_MAX;
 use crate::clock::Clock;
 use crate::config::oidc::SESSION_HOURS_RANGE;
 use crate::db::Db;
@@ -30,7 +30,7 @@ impl io::Write for Log {
 #[test]
 fn a_person_is_signed_in_for_no_longer_than_a_token() {
     let most = i64::from(*SESSION_HOURS_RANGE.end());
-    assert_eq!(SignedDuration::from_hours(most), SESSION_LASTS);
+    assert_eq!(SignedDuration::from_hours(most), SESSION_LIFETIME_MAX);
 }
 
 #[tokio::test]
