@@ -13,7 +13,7 @@ use tokio::time::Instant;
 /// Longest wait for a process that was asked to stop.
 const STOP_WAIT_MAX: Duration = Duration::from_secs(15);
 /// Time between two looks at a process that is to end.
-const LOOK_EVERY: Duration = Duration::from_millis(10);
+const POLL_INTERVAL: Duration = Duration::from_millis(10);
 /// Ticks per second of the kernel's CPU accounting, the same on every Linux of today.
 const CLOCK_TICKS_PER_SECOND: f64 = 100.0;
 
@@ -119,7 +119,7 @@ impl Process {
                 self.kill();
                 anyhow::bail!("{} did not stop within {STOP_WAIT_MAX:?}", self.name);
             }
-            tokio::time::sleep(LOOK_EVERY).await;
+            tokio::time::sleep(POLL_INTERVAL).await;
         }
     }
 

@@ -12,7 +12,7 @@ use crate::database::FleetDatabase;
 
 /// Longest wait for the sums of what was uploaded: the server stores them every few seconds.
 const SUMS_WAIT_MAX: Duration = Duration::from_secs(30);
-const LOOK_EVERY: Duration = Duration::from_millis(200);
+const POLL_INTERVAL: Duration = Duration::from_millis(200);
 
 /// Numbers of stored segments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -106,6 +106,6 @@ pub async fn await_sums(database: &FleetDatabase) -> anyhow::Result<()> {
             begin.elapsed() < SUMS_WAIT_MAX,
             "{segments} segments are stored, and {in_sums} are in the sums"
         );
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
 }

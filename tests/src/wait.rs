@@ -7,7 +7,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 /// Time between two looks.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Longest wait for anything that takes no driving.
 pub const SHORT: Duration = Duration::from_secs(15);
 /// Longest wait for a robot to drive a short mission.
@@ -37,6 +37,6 @@ where
             Instant::now() < deadline,
             "not within {bound:?}: {what}; seen last: {seen:#?}"
         );
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
 }

@@ -17,7 +17,7 @@ use crate::client::Client;
 use crate::output::{Output, WaitTimeout, print_note};
 
 /// Polling period of the missions.
-const POLL_EVERY: Duration = Duration::from_millis(250);
+const POLL_INTERVAL: Duration = Duration::from_millis(250);
 /// Number of steps of a bar.
 const STEPS: usize = 1_000;
 
@@ -130,7 +130,7 @@ pub(super) async fn wait(
             );
             return Err(WaitTimeout(text).into());
         }
-        tokio::time::sleep(POLL_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
 }
 

@@ -13,7 +13,7 @@ use crate::client::{Client, ClientError};
 use crate::output::{Output, or_dash, print_note, render, table};
 
 /// Interval between looks at a test that is under way.
-const POLL_EVERY: Duration = Duration::from_millis(250);
+const POLL_INTERVAL: Duration = Duration::from_millis(250);
 /// Number of looks after which a test counts as not arrived: longer than an attempt takes.
 const POLLS_MAX: u32 = 80;
 
@@ -127,7 +127,7 @@ async fn await_attempt(
             Some(delivery) if delivery.attempts > 0 => return Ok(delivery),
             found => last = found.or(last),
         }
-        tokio::time::sleep(POLL_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
     last.context("the test is not in the log of deliveries")
 }

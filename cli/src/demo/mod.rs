@@ -36,7 +36,7 @@ const START_WAIT_MAX: Duration = Duration::from_secs(30);
 /// Maximum time for the last measurements to be uploaded after the last mission has ended.
 const UPLOAD_WAIT_MAX: Duration = Duration::from_secs(10);
 /// Polling period of the fleet.
-const POLL_EVERY: Duration = Duration::from_millis(200);
+const POLL_INTERVAL: Duration = Duration::from_millis(200);
 /// Number of newest missions that are polled.
 const MISSIONS_MAX: u32 = 1_000;
 
@@ -222,7 +222,7 @@ impl Demo<'_> {
                 Instant::now() < deadline,
                 "the server is not ready after {START_WAIT_MAX:?}"
             );
-            tokio::time::sleep(POLL_EVERY).await;
+            tokio::time::sleep(POLL_INTERVAL).await;
         }
         Ok(())
     }
@@ -273,7 +273,7 @@ impl Demo<'_> {
                     missing.id
                 );
             }
-            tokio::time::sleep(POLL_EVERY).await;
+            tokio::time::sleep(POLL_INTERVAL).await;
         }
     }
 
@@ -372,7 +372,7 @@ impl<'demo> Watch<'demo> {
     /// Returns when all missions have ended and all measurements are uploaded, or when the time is
     /// over. Without a time limit it shows the fleet until it is cancelled.
     async fn until_done(&mut self, processes: &mut Processes) -> anyhow::Result<()> {
-        let mut ticks = tokio::time::interval(POLL_EVERY);
+        let mut ticks = tokio::time::interval(POLL_INTERVAL);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut uploads_until: Option<Instant> = None;
         loop {
@@ -415,7 +415,7 @@ impl<'demo> Watch<'demo> {
             let place = live.pose.filter(|_| live.mission.is_some());
             let under = place.and_then(|pose| terrain_at(&self.shapes, pose.value.position()));
             if let Some(shape) = under {
-                *self.driven.entry(shape.terrain.id.clone()).or_default() += POLL_EVERY;
+                *self.driven.entry(shape.terrain.id.clone()).or_default() += POLL_INTERVAL;
             }
         }
         self.progress.show(&robots, &self.seen);

@@ -23,7 +23,7 @@ const PORTS_TRIED: u16 = 50;
 /// Maximum time for processes to stop; afterwards they are killed.
 const STOP_WAIT_MAX: Duration = Duration::from_secs(10);
 /// Polling period of processes that are stopping.
-const POLL_EVERY: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Number of log lines to show when a process has ended unexpectedly.
 const LOG_LINES_SHOWN: usize = 15;
 
@@ -190,7 +190,7 @@ async fn stop_all(parts: &mut [Part]) {
     let deadline = Instant::now() + STOP_WAIT_MAX;
     for part in parts {
         while Instant::now() < deadline && matches!(part.child.try_wait(), Ok(None)) {
-            tokio::time::sleep(POLL_EVERY).await;
+            tokio::time::sleep(POLL_INTERVAL).await;
         }
         _ = part.child.kill();
         _ = part.child.wait();

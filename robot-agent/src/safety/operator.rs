@@ -57,7 +57,7 @@ enum Granted {
 #[derive(Debug, Clone)]
 struct ActiveLease {
     lease: Lease,
-    heard_us: u64,
+    last_message_us: u64,
     last_seq: Option<u64>,
 }
 
@@ -122,10 +122,9 @@ impl Operator {
     }
 
     fn expire_if_silent(&mut self, now_us: u64) {
-        let is_silent = self
-            .active
-            .as_ref()
-            .is_some_and(|active| now_us >= active.heard_us.saturating_add(LEASE_SILENCE_MAX_US));
+        let is_silent = self.active.as_ref().is_some_and(|active| {
+            now_us >= active.last_message_us.saturating_add(LEASE_SILENCE_MAX_US)
+        });
         if is_silent {
             self.clear_lease();
         }
@@ -148,7 +147,7 @@ impl Operator {
                 epoch: self.epoch,
                 driver,
             },
-            heard_us: now_us,
+            last_message_us: now_us,
             last_seq: None,
         });
         self.meter = AgeMeter::default();
@@ -247,7 +246,7 @@ impl Operator {
         let age_us = now_us.saturating_sub(command.sent_us);
         self.meter.record(seconds_of(age_us));
         if let Some(active) = &mut self.active {
-            active.heard_us = now_us;
+            active.last_message_us = now_us;
             active.last_seq = Some(command.seq);
         }
         verdict
@@ -282,7 +281,7 @@ impl Operator {
     pub(crate) fn view(&self) -> TeleoperationView {
         TeleoperationView {
             lease: self.active.as_ref().map(|active| {
-                let until_us = active.heard_us.saturating_add(LEASE_SILENCE_MAX_US);
+                let until_us = active.last_message_us.saturating_add(LEASE_SILENCE_MAX_US);
                 (active.lease.epoch, until_us)
             }),
             wanted: self.wanted,
@@ -293,7 +292,7 @@ impl Operator {
     /// Returns the lease in force at `now_us`.
     pub(crate) fn lease_at(&self, now_us: u64) -> Option<&Lease> {
         let active = self.active.as_ref()?;
-        let until_us = active.heard_us.saturating_add(LEASE_SILENCE_MAX_US);
+        let until_us = active.last_message_us.saturating_add(LEASE_SILENCE_MAX_US);
         (now_us < until_us).then_some(&active.lease)
     }
 

@@ -94,7 +94,7 @@ pub(super) async fn drive(
             session,
             subject,
             robot: (site, robot),
-            heard_at: Instant::now(),
+            last_message_at: Instant::now(),
             ping_due: Instant::now(),
             pinged_at: None,
             socket_delay: None,
@@ -120,7 +120,7 @@ struct Connection {
     session: Session,
     subject: Arc<Credential>,
     robot: (SiteId, RobotId),
-    heard_at: Instant,
+    last_message_at: Instant,
     ping_due: Instant,
     /// Time of the ping that is not answered yet.
     pinged_at: Option<Instant>,
@@ -222,7 +222,7 @@ impl Connection {
                     .map_or(Err(End::Gone), |(code, detail)| refused(code, detail));
             }
         };
-        self.heard_at = Instant::now();
+        self.last_message_at = Instant::now();
         match message {
             Message::Text(text) => match parse_frame(&text) {
                 Ok(request) => Ok(Some(request)),
@@ -311,7 +311,7 @@ impl Connection {
 
     /// Sends the robot's state and pings, and checks that the lease and the client are still there.
     async fn show(&mut self) -> Result<(), End> {
-        if self.heard_at.elapsed() > SILENCE_MAX {
+        if self.last_message_at.elapsed() > SILENCE_MAX {
             return Err(End::Closed {
                 code: close_code::POLICY,
                 detail: "the server received no frame on this socket, not even a pong".to_owned(),

@@ -20,7 +20,7 @@ use crate::clock::Clock;
 use crate::config::TlsFiles;
 
 /// Interval of checks whether the files have changed, or another certificate is due.
-pub const LOOK_EVERY: Duration = Duration::from_mins(1);
+pub const POLL_INTERVAL: Duration = Duration::from_mins(1);
 
 /// Reason why certificate and key cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -198,7 +198,7 @@ pub async fn reload_periodically(tls: &Tls, stop: CancellationToken, looked: imp
         looked(tls);
         tokio::select! {
             () = stop.cancelled() => return,
-            () = tokio::time::sleep(LOOK_EVERY) => {}
+            () = tokio::time::sleep(POLL_INTERVAL) => {}
         }
         let now = tls.changed_at();
         if now == seen && !tls.is_due() {

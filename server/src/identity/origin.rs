@@ -135,7 +135,7 @@ impl Provenance<'_> {
     /// Returns whether no foreign page caused this request: `Sec-Fetch-Site` is `same-origin` or
     /// `none` (address typed by the user), or missing, as in requests of programs that are no
     /// browsers.
-    pub fn is_no_foreign_page(&self) -> bool {
+    pub fn is_not_cross_site(&self) -> bool {
         matches!(self.fetch_site, None | Some("same-origin" | "none"))
     }
 

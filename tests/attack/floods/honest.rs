@@ -26,7 +26,7 @@ use super::HONEST_ROBOT;
 /// Time between two stops of the operator.
 const STOP_EVERY: Duration = Duration::from_millis(200);
 /// Time between two looks at the other robot's state.
-const LOOK_EVERY: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Time between two introductions of the quiet robot.
 const HELLO_EVERY: Duration = Duration::from_millis(500);
 /// Time between two pieces of the operator's other work.
@@ -218,7 +218,7 @@ async fn stop(http: SocketAddr, operator: String, (worked, is_over): SharedState
 /// The operator looks at the honest robot.
 async fn look(rest: Rest, (worked, is_over): SharedState) {
     let path = format!("/v1/sites/{SITE}/robots/{HONEST_ROBOT}");
-    let mut rounds = Rounds::new(LOOK_EVERY, is_over);
+    let mut rounds = Rounds::new(POLL_INTERVAL, is_over);
     while rounds.next().await.is_some() {
         let asked = timeout(ANSWER_MAX, rest.call(Method::GET, &path, None)).await;
         record(&worked, |worked| match asked {

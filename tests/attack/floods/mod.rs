@@ -37,7 +37,7 @@ const ABSENT_ROBOTS: u32 = 200;
 /// How long a robot's certificate is good for, seconds.
 const CERTIFICATE_S: u32 = 86_400;
 /// Time between two looks at the server.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
+const POLL_INTERVAL: Duration = Duration::from_millis(250);
 /// How long the attackers may take beyond the floods: to connect, and to end.
 const BEYOND_MAX: Duration = Duration::from_mins(2);
 /// The robot that drives, or would.
@@ -116,7 +116,7 @@ async fn attack(fleet: &Fleet, plan: &Plan, nice: u8) -> anyhow::Result<Vec<Done
             break status;
         }
         anyhow::ensure!(Instant::now() < bound, "the attackers do not end");
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     };
     let said = || std::fs::read_to_string(&log).unwrap_or_default();
     anyhow::ensure!(status.success(), "the attackers failed: {}", said());
@@ -132,7 +132,7 @@ async fn watch(fleet: &Fleet, used: &mut Used) {
             used.cpu_s = usage.cpu_s;
         }
         used.log_mib = mib(fleet.log_bytes("server"));
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
     used.has_ended = true;
 }

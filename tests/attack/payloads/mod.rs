@@ -28,7 +28,7 @@ const STATE_AGE_MAX_MS: f64 = 1_000.0;
 /// Longest wait for the answer to another robot's introduction.
 const HELLO_MAX_MS: f64 = 2_000.0;
 /// Time between two looks at the other robots.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
+const POLL_INTERVAL: Duration = Duration::from_millis(250);
 /// Robots that send damaged payloads.
 const ROBOTS: u32 = 3;
 
@@ -108,7 +108,7 @@ pub(crate) async fn run(arguments: &Arguments, json: bool) -> anyhow::Result<Exi
         let begun = Instant::now();
         failed += u64::from(quiet.hello().await.is_err());
         hellos_ms.push(1e3 * begun.elapsed().as_secs_f64());
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
     let survived = !fleet.has_server_ended();
     if survived {

@@ -27,7 +27,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(15);
 /// Longest time for a server to decide on a resumption: the servers of a pair exchange places.
 const RESUMED_WITHIN: Duration = Duration::from_secs(30);
 /// Time between two looks.
-const LOOK_EVERY: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Tries to send a mission to a server that is away.
 const SEND_TRIES_MAX: u32 = 200;
 
@@ -180,7 +180,7 @@ async fn send(fleet: &mut Fleet, body: &Value) -> MissionId {
         {
             return serde_json::from_value(answer["id"].clone()).expect("a mission has an id");
         }
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
     panic!("the server takes no missions");
 }
@@ -260,7 +260,7 @@ impl Stage<'_> {
                     == Outcome::Unavailable
                     && Instant::now() < deadline
                 {
-                    tokio::time::sleep(LOOK_EVERY).await;
+                    tokio::time::sleep(POLL_INTERVAL).await;
                 }
             }
             Action::Replace(index) => {
@@ -352,7 +352,7 @@ async fn ended(fleet: &mut Fleet, followed: &[Followed]) -> Vec<MissionDetail> {
                 fleet.servers_log_tail()
             ),
         }
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
 }
 
@@ -381,7 +381,7 @@ async fn await_quiet(fleet: &mut Fleet, robot: &RobotId) {
         if is_quiet || Instant::now() > deadline {
             return;
         }
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
 }
 
@@ -405,6 +405,6 @@ async fn details_now(fleet: &mut Fleet, followed: &[Followed]) -> Option<Vec<Mis
         if found.is_some() || Instant::now() > deadline {
             return found;
         }
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
 }

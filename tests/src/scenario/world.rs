@@ -32,7 +32,7 @@ pub const PACE: f64 = 20.0;
 /// The same while nobody drives.
 const PACE_IDLE: f64 = 200.0;
 /// Time between two looks at the server, real.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Longest wait for something that takes no driving, real.
 const SOON: Duration = Duration::from_mins(1);
 /// Longest wait for missions, real: a machine that does nothing else needs a fraction of it.
@@ -313,7 +313,7 @@ impl World {
                 if let Some(found) = look().await {
                     return found;
                 }
-                tokio::time::sleep(LOOK_EVERY).await;
+                tokio::time::sleep(POLL_INTERVAL).await;
             }
         };
         let found = tokio::time::timeout(bound, looking).await;

@@ -60,7 +60,7 @@ pub struct Ros2Drive {
     command_cell: Arc<CommandCell>,
     now: Duration,
     /// When the last whole sample was measured.
-    heard_at: Option<Duration>,
+    last_sample_at: Option<Duration>,
     /// The base was silent, and the loop has not come to rest since.
     is_rest_required: bool,
     /// Whether wheels are believed whatever they do.
@@ -122,7 +122,7 @@ impl Ros2Drive {
             counts,
             command_cell: Arc::clone(&command_cell),
             now: Duration::ZERO,
-            heard_at: None,
+            last_sample_at: None,
             is_rest_required: false,
             settings: Arc::clone(&settings),
         };
@@ -182,7 +182,7 @@ impl Drive for Ros2Drive {
             if is_whole {
                 // The base is as old as the older half of its word.
                 let turned_at = self.assembler.turned_at().unwrap_or(arrived.at);
-                self.heard_at = Some(arrived.at.min(turned_at));
+                self.last_sample_at = Some(arrived.at.min(turned_at));
             }
         }
         feedback
@@ -207,8 +207,8 @@ impl Drive for Ros2Drive {
 
     fn is_silent(&self) -> bool {
         let silent_after = self.settings.timing.silent_after;
-        self.heard_at
-            .is_none_or(|heard_at| self.now.saturating_sub(heard_at) > silent_after)
+        self.last_sample_at
+            .is_none_or(|last_sample_at| self.now.saturating_sub(last_sample_at) > silent_after)
     }
 
     fn silent_after(&self) -> Duration {

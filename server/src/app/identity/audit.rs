@@ -81,7 +81,7 @@ enum Author {
     Person(PersonId),
     /// Robots that joined or renewed a certificate, all together.
     Joining,
-    Stranger,
+    Unauthenticated,
 }
 
 impl Author {
@@ -90,14 +90,14 @@ impl Author {
             (Some(token), _) => Self::Token(token),
             (None, Some(person)) => Self::Person(person.id),
             (None, None) if entry.status < 400 => Self::Joining,
-            (None, None) => Self::Stranger,
+            (None, None) => Self::Unauthenticated,
         }
     }
 
     const fn limit(self) -> RateLimit {
         let burst = match self {
             Self::Token(_) | Self::Person(_) | Self::Joining => SHARE_BURST,
-            Self::Stranger => UNAUTHENTICATED_BURST,
+            Self::Unauthenticated => UNAUTHENTICATED_BURST,
         };
         RateLimit {
             burst,

@@ -340,7 +340,7 @@ impl App {
             };
             self.log_failure("begin a sign-in", &error);
         }
-        if !is_at_home || !provenance.is_no_foreign_page() {
+        if !is_at_home || !provenance.is_not_cross_site() {
             return Ok(SignInRedirect {
                 location: format!("{}/", people.home),
                 cookie: None,

@@ -37,7 +37,7 @@ pub(super) struct OtherRun {
     pub(super) boot: BootId,
     since: Duration,
     /// Time of its last heartbeat, since the start of the server.
-    heard_at: Duration,
+    last_message_at: Duration,
     ticks: u64,
     mission: Option<MissionId>,
     /// Whether it has been sending for at least [`DUPLICATE_AFTER`].
@@ -56,7 +56,7 @@ impl Presence {
         let fresh = OtherRun {
             boot: state.boot,
             since: now,
-            heard_at: now,
+            last_message_at: now,
             ticks,
             mission: state.mission.map(|mission| mission.id),
             is_duplicate: false,
@@ -105,7 +105,7 @@ impl Presences {
             let Some(other) = presence.other else {
                 continue;
             };
-            if now.saturating_sub(other.heard_at) > DUPLICATE_TIMEOUT {
+            if now.saturating_sub(other.last_message_at) > DUPLICATE_TIMEOUT {
                 presence.remove_other();
             } else if other.is_duplicate {
                 duplicates.push(DuplicateAgent {

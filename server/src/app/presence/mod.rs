@@ -65,7 +65,7 @@ pub struct Presence {
     boot: Option<(BootId, Duration)>,
     /// Time of the last heartbeat: a state in which the tick count of the control loop had
     /// increased.
-    heard_at: Option<Duration>,
+    last_heartbeat_at: Option<Duration>,
     /// Time of the last message of any kind.
     last_message_at: Option<Duration>,
     /// Whether the last token vanished shortly after a heartbeat.
@@ -116,7 +116,7 @@ impl Presence {
                 LinkCause::ServerRestarted
             } else if self.tokens.is_empty() && self.vanished_suddenly {
                 LinkCause::RobotOff
-            } else if self.heard_at.is_none() && !self.tokens.is_empty() {
+            } else if self.last_heartbeat_at.is_none() && !self.tokens.is_empty() {
                 LinkCause::Joining
             } else if is_recent && !self.tokens.is_empty() {
                 LinkCause::LoopStopped
@@ -139,7 +139,7 @@ impl Presence {
 
     /// Time since the last heartbeat; `None` if there was none.
     pub fn silent_for(&self, now: Duration) -> Option<Duration> {
-        self.heard_at.map(|at| now.saturating_sub(at))
+        self.last_heartbeat_at.map(|at| now.saturating_sub(at))
     }
 
     /// Returns the offset of the robot's wall clock, robot minus server, milliseconds; 0 if it is
@@ -402,7 +402,7 @@ impl Presences {
             .state()
             .is_none_or(|before| state.control_loop.ticks > before.control_loop.ticks);
         if beats {
-            presence.heard_at = Some(now);
+            presence.last_heartbeat_at = Some(now);
         }
         presence.last_message_at = Some(now);
         if presence

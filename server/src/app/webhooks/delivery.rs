@@ -35,7 +35,7 @@ use crate::db::webhooks::{AgeLimit, Due, DueTimes, Outcome};
 use crate::webhooks::{Attempt, OutgoingDelivery, Sender};
 
 /// Interval between looks at the outbox when nothing wakes the task.
-pub const LOOK_EVERY: Duration = Duration::from_secs(1);
+pub const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// Time after a failure of the database in which it is left to others.
 const REST_AFTER_ERROR: Duration = Duration::from_secs(3);
 /// Maximum number of attempts under way at once, at most one per webhook.
@@ -89,7 +89,7 @@ pub async fn run(app: App, sender: Sender, stop: CancellationToken) {
                 () = stop.cancelled() => break,
                 Some(done) = dispatcher.finishing.recv() => dispatcher.record(done),
                 () = app.webhooks().woken.notified() => {}
-                () = tokio::time::sleep(LOOK_EVERY) => {}
+                () = tokio::time::sleep(POLL_INTERVAL) => {}
             }
         }
         while let Ok(done) = dispatcher.finishing.try_recv() {

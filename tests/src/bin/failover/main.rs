@@ -36,7 +36,7 @@ const UPLOADED_MIN: f64 = 0.95;
 /// Longest time until a server that was woken up, or connected again, has ended.
 const WOKEN_MAX_S: f64 = 5.0;
 /// Time between two looks.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Time that robots drive between two trials.
 const DRIVING: Duration = Duration::from_secs(3);
 /// Distance between two robots, metres.
@@ -102,7 +102,7 @@ async fn until(
             "not within {DRIVE:?}: {what}: {:#?}",
             fleet.servers_log_tail()
         );
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
     Ok(began.elapsed().as_secs_f64())
 }

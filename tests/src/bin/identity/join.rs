@@ -15,7 +15,7 @@ use crate::Arguments;
 /// Longest time until the server hears a robot that joins, seconds.
 const JOIN_MAX_S: f64 = 5.0;
 /// Time between two looks at the others.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// What an agent logs each time that it connects.
 const CONNECTED: &str = "connected to";
 
@@ -74,7 +74,7 @@ pub(crate) async fn measure(
         if is_online || took > DRIVE {
             break took.as_secs_f64();
         }
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     };
     let mut disturbed = 0;
     for mission in missions {

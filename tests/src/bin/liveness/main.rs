@@ -32,7 +32,7 @@ const DEATH_MAX_S: f64 = 0.2;
 /// Healing to `online`, at the most.
 const HEALING_MAX_S: f64 = 2.0;
 /// Time between two looks.
-const LOOK_EVERY: Duration = Duration::from_millis(5);
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
 /// Longest wait for any of them.
 const WAIT_MAX: Duration = Duration::from_secs(30);
 /// Longest cut.
@@ -91,7 +91,7 @@ async fn shown_since(
             "the robot was not shown {link:?} within {WAIT_MAX:?}: {:?}",
             fleet.log_tail(robot.as_str()),
         );
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
 }
 

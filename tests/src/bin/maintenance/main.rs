@@ -47,7 +47,7 @@ const RESTORED_WITHIN_S: f64 = 60.0;
 /// Time for which the REST API may be away during an upgrade, seconds.
 const REST_AWAY_MAX_S: f64 = 5.0;
 /// Interval of the looks at the size of the log, and at the REST API.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Rate of uploads while the database grows, as a multiple of the measured one.
 const GROWTH_FACTOR: f64 = 3.0;
 /// Longest time until the database has its size.
@@ -181,7 +181,7 @@ impl Watch {
         looking.spawn(async move {
             loop {
                 noted.fetch_max(size_of(&file), Ordering::Relaxed);
-                tokio::time::sleep(LOOK_EVERY).await;
+                tokio::time::sleep(POLL_INTERVAL).await;
             }
         });
         Self {
@@ -289,7 +289,7 @@ async fn grow(arguments: &Arguments, fleet: &Fleet, uploads: &Uploads) -> anyhow
     let begin = Instant::now();
     while mib(size_of(&fleet.database_file())) < f64::from(arguments.megabytes) {
         ensure!(begin.elapsed() < GROWTH_MAX, "the database does not grow");
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
     uploads.set_rate(f64::from(arguments.segments_per_second))
 }
@@ -419,7 +419,7 @@ impl Downtime {
                 }
                 let away_us = u64::try_from(answered_at.elapsed().as_micros());
                 noted.fetch_max(away_us.unwrap_or(u64::MAX), Ordering::Relaxed);
-                tokio::time::sleep(LOOK_EVERY).await;
+                tokio::time::sleep(POLL_INTERVAL).await;
             }
         });
         Self {

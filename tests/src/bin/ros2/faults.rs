@@ -28,7 +28,7 @@ const AGAIN_MAX: Duration = Duration::from_secs(10);
 /// The same on a slow machine.
 const AGAIN_AT_ALL_MAX: Duration = Duration::from_mins(1);
 /// Time between two looks.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// How long it must have moved before the next fault.
 const MOVES_FOR: Duration = Duration::from_secs(2);
 
@@ -225,7 +225,7 @@ impl Trial<'_> {
             if Instant::now() >= until {
                 return false;
             }
-            tokio::time::sleep(LOOK_EVERY).await;
+            tokio::time::sleep(POLL_INTERVAL).await;
         }
     }
 
@@ -243,7 +243,7 @@ impl Trial<'_> {
             } else {
                 since = None;
             }
-            tokio::time::sleep(LOOK_EVERY).await;
+            tokio::time::sleep(POLL_INTERVAL).await;
         }
         false
     }

@@ -19,7 +19,7 @@ use tread_tests::report::{Check, quantile};
 /// Longest that a mission may take.
 const MISSION_MAX: Duration = Duration::from_mins(2);
 /// Time between two looks at a mission.
-const LOOK_EVERY: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Cross-track of the ROS 2 robot over that of the simulated one, at most.
 const CROSS_TRACK_RATIO_MAX: f64 = 1.2;
 /// Error of θ as a share of it, at most.
@@ -73,7 +73,7 @@ async fn drive(
         if seen.mission.state.is_terminal() || Instant::now() > until {
             break seen;
         }
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     };
     anyhow::ensure!(
         ended.mission.state == MissionState::Succeeded,

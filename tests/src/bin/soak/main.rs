@@ -36,7 +36,7 @@ const MESSAGES: (f64, f64) = (50.0, 2_000.0);
 /// Time between two questions of the robot that behaves well.
 const ASK_EVERY: Duration = Duration::from_millis(100);
 /// Time between two looks at the server.
-const LOOK_EVERY: Duration = Duration::from_millis(500);
+const POLL_INTERVAL: Duration = Duration::from_millis(500);
 /// Answers to one question that are kept.
 const REPLIES_MAX: usize = 4;
 /// Longest wait for an answer to a damaged question, which nobody reads.
@@ -101,7 +101,7 @@ async fn misbehave(
             tokio::time::timeout(Duration::from_secs(10), connecting).await
         else {
             counts.refused_connections.fetch_add(1, Ordering::Relaxed);
-            tokio::time::sleep(LOOK_EVERY).await;
+            tokio::time::sleep(POLL_INTERVAL).await;
             continue;
         };
         counts.connections.fetch_add(1, Ordering::Relaxed);
@@ -267,7 +267,7 @@ async fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     }
     let watching = async {
         while Instant::now() < until && !fleet.has_server_ended() {
-            tokio::time::sleep(LOOK_EVERY).await;
+            tokio::time::sleep(POLL_INTERVAL).await;
         }
     };
     // A server that has ended answers nobody, so there is nothing to wait for.

@@ -28,7 +28,7 @@ const CPU_RATIO_MAX: f64 = 1.1;
 /// Longest wait for equal answers, after which they count as different.
 const GIVE_UP: Duration = Duration::from_secs(5);
 /// Time between two looks at the standby.
-const LOOK_EVERY: Duration = Duration::from_millis(5);
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
 /// Segments of an upload.
 const BATCH: usize = 100;
 /// Uploads of each robot before the first comparison: all cells that it visits.
@@ -95,7 +95,7 @@ async fn until_equal(
         if received_at.elapsed() > GIVE_UP {
             return Ok(None);
         }
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
 }
 
