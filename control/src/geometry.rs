@@ -1,4 +1,4 @@
-//! Points, poses and velocities in the plane.
+//! Points, bounding boxes, poses and velocities in the plane.
 
 use std::f64::consts::{PI, TAU};
 
@@ -28,6 +28,68 @@ impl Point {
     /// Returns whether both coordinates are finite.
     pub fn is_finite(self) -> bool {
         self.x_m.is_finite() && self.y_m.is_finite()
+    }
+}
+
+/// Axis-aligned bounding box of some points.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BoundingBox {
+    low: Point,
+    high: Point,
+}
+
+impl BoundingBox {
+    /// Returns the smallest box around some points; the box around none contains no point.
+    pub fn around(points: impl IntoIterator<Item = Point>) -> Self {
+        let nothing = Self {
+            low: Point {
+                x_m: f64::INFINITY,
+                y_m: f64::INFINITY,
+            },
+            high: Point {
+                x_m: f64::NEG_INFINITY,
+                y_m: f64::NEG_INFINITY,
+            },
+        };
+        points.into_iter().fold(nothing, |bounds, point| Self {
+            low: Point {
+                x_m: bounds.low.x_m.min(point.x_m),
+                y_m: bounds.low.y_m.min(point.y_m),
+            },
+            high: Point {
+                x_m: bounds.high.x_m.max(point.x_m),
+                y_m: bounds.high.y_m.max(point.y_m),
+            },
+        })
+    }
+
+    /// Returns whether a point is in the box or on its border.
+    pub fn contains(&self, point: Point) -> bool {
+        (self.low.x_m..=self.high.x_m).contains(&point.x_m) && self.spans_height_of(point)
+    }
+
+    /// Returns the distance of a point from the box along each axis, `(x, y)`, metres; 0 within.
+    pub(crate) fn axis_distances_m(&self, point: Point) -> (f64, f64) {
+        let distance_m = |value: f64, low: f64, high: f64| (low - value).max(value - high).max(0.0);
+        (
+            distance_m(point.x_m, self.low.x_m, self.high.x_m),
+            distance_m(point.y_m, self.low.y_m, self.high.y_m),
+        )
+    }
+
+    /// Returns the squared distance of a point from the box; 0 within.
+    pub(crate) fn distance_m2(&self, point: Point) -> f64 {
+        let (x_m, y_m) = self.axis_distances_m(point);
+        x_m * x_m + y_m * y_m
+    }
+
+    /// Returns whether the ray from a point in the direction of x can meet something in the box.
+    pub(crate) fn is_met_by_ray(&self, point: Point) -> bool {
+        self.spans_height_of(point) && point.x_m <= self.high.x_m
+    }
+
+    fn spans_height_of(&self, point: Point) -> bool {
+        (self.low.y_m..=self.high.y_m).contains(&point.y_m)
     }
 }
 
@@ -114,5 +176,18 @@ mod tests {
             let seen = pose.body_from_site(Point { x_m: x_m + 2.0 * cos, y_m: y_m + 2.0 * sin });
             prop_assert!((seen.x_m - 2.0).abs() < 1.0e-9 && seen.y_m.abs() < 1.0e-9);
         }
+    }
+
+    #[test]
+    fn a_box_contains_its_points_and_one_around_none_contains_nothing() {
+        let point = |x_m, y_m| Point { x_m, y_m };
+        let corners = [point(1.0, 5.0), point(-2.0, 3.0)];
+        let bounds = BoundingBox::around(corners);
+        assert!(corners.into_iter().all(|corner| bounds.contains(corner)));
+        assert!(bounds.contains(point(0.0, 4.0)));
+        for outside in [point(1.1, 4.0), point(0.0, 2.9), point(0.0, 5.1)] {
+            assert!(!bounds.contains(outside), "{outside:?}");
+        }
+        assert!(!BoundingBox::around([]).contains(Point::default()));
     }
 }

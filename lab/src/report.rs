@@ -8,6 +8,12 @@ use serde_json::{Value, json};
 /// Half-width of a 95 % interval of θ over its value above which an answer counts as none.
 pub const WIDE_RATIO: f64 = 0.6;
 
+/// Returns the median; 0 of nothing.
+pub fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or_default()
+}
+
 /// One figure that must be reached.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Check {

@@ -313,7 +313,8 @@ pub struct StorageConfig {
 
 /// Range of the minimum free disk space, in MiB.
 pub const DISK_FREE_MIN_MIB_RANGE: std::ops::RangeInclusive<u64> = 16..=1_000_000_000;
-const BYTES_PER_MIB: u64 = 1_024 * 1_024;
+/// Bytes of a MiB.
+pub(crate) const BYTES_PER_MIB: u64 = 1_024 * 1_024;
 
 impl Default for StorageConfig {
     fn default() -> Self {

@@ -67,7 +67,7 @@ pub(crate) async fn run(args: HealthArgs) -> anyhow::Result<()> {
 }
 
 /// Returns an address by which this machine reaches what listens on `address`.
-fn reachable(address: SocketAddr) -> SocketAddr {
+pub(crate) fn reachable(address: SocketAddr) -> SocketAddr {
     let ip = match address.ip() {
         IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
         IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),

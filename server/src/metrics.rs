@@ -17,10 +17,9 @@ use prometheus_client::registry::{Registry, Unit};
 use tokio::sync::mpsc;
 use tread_api::mission::MissionState;
 use tread_api::problem::ProblemType;
+use tread_store::metrics::BOUNDS_S;
 pub use tread_store::metrics::{DatabaseMetrics, SLOW_AFTER, SlowUseCase};
 
-/// Upper bounds of the histogram buckets of requests, in seconds.
-const BOUNDS_S: [f64; 10] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.5, 1.0, 5.0];
 /// Upper bounds of the histogram buckets of missions, in seconds.
 const MISSION_BOUNDS_S: [f64; 10] = [
     5.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1_800.0, 3_600.0, 14_400.0,

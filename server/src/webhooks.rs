@@ -11,12 +11,14 @@
 //! is repeated, is decided in [`crate::app`].
 
 mod address;
+mod outgoing;
 mod sender;
 mod signature;
 
 pub use self::address::{InvalidUrl, Rules, is_public};
+pub use self::outgoing::OutgoingDelivery;
 pub use self::sender::{
-    ANSWER_MAX, Attempt, BODY_MAX, CONNECT_MAX, OutgoingDelivery, RESOLVE_MAX, Resolved, Resolver,
-    Sender, SenderError, SystemResolver,
+    ANSWER_MAX, Attempt, BODY_MAX, CONNECT_MAX, RESOLVE_MAX, Resolved, Resolver, Sender,
+    SenderError, SystemResolver,
 };
 pub use self::signature::signature;

@@ -9,7 +9,6 @@
 
 use super::Finding;
 use super::history::BIN_S;
-use super::verdict::Verdict;
 
 /// Time for which a channel must agree until its finding ends, seconds.
 const CLEAR_S: f64 = 2.0;
@@ -20,6 +19,31 @@ const REST_CLEAR_S: f64 = 10.0;
 const REST_CLEAR_MAX_S: f64 = 600.0;
 /// Maximum number of relapses that are counted.
 const RELAPSES_MAX: u32 = 16;
+
+/// Result for one subject in one bin.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Verdict {
+    /// It contradicts; the finding becomes active once that has lasted the given number of seconds.
+    Contradicts(Finding, f64),
+    /// It contradicts, and a finding is active already.
+    StillContradicts,
+    /// It is confirmed to be right.
+    Agrees,
+    /// It agrees with a stopped robot.
+    AgreesAtRest,
+    /// There is no evidence.
+    Nothing,
+}
+
+impl Verdict {
+    /// Returns this result with a duration of 0 until the finding becomes active.
+    pub(super) fn at_once(self) -> Self {
+        match self {
+            Self::Contradicts(finding, _) => Self::Contradicts(finding, 0.0),
+            Self::StillContradicts | Self::Agrees | Self::AgreesAtRest | Self::Nothing => self,
+        }
+    }
+}
 
 /// Evidence on one subject.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

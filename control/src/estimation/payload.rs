@@ -11,7 +11,7 @@ use crate::robot::RobotModel;
 /// Minimum duration of a standstill after which the payload may have changed, seconds.
 const STANDSTILL_MIN_S: f64 = 5.0;
 /// Rim speed of the faster side below which the robot counts as standing, metres per second.
-const STANDING_M_S: f64 = 0.02;
+pub(super) const STANDING_M_S: f64 = 0.02;
 /// Minimum change of the apparent mass that is reported, relative to the model's mass.
 const CHANGE_MIN_RATIO: f64 = 0.05;
 /// Minimum change that is reported, in standard deviations of the difference.

@@ -4,7 +4,7 @@
 //! farther away than the nearest side found so far and the ray from the point in the direction of x
 //! cannot meet it.
 
-use crate::geometry::Point;
+use crate::geometry::{BoundingBox, Point};
 
 /// Number of sides in a group.
 const GROUP_SIDES: usize = 12;
@@ -17,62 +17,10 @@ struct Side {
     inverse_length_1_m2: f64,
 }
 
-/// Axis-aligned bounding box of some points.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Bounds {
-    low: Point,
-    high: Point,
-}
-
-impl Bounds {
-    fn of(points: impl Iterator<Item = Point>) -> Self {
-        let nothing = Self {
-            low: Point {
-                x_m: f64::INFINITY,
-                y_m: f64::INFINITY,
-            },
-            high: Point {
-                x_m: f64::NEG_INFINITY,
-                y_m: f64::NEG_INFINITY,
-            },
-        };
-        points.fold(nothing, |bounds, point| Self {
-            low: Point {
-                x_m: bounds.low.x_m.min(point.x_m),
-                y_m: bounds.low.y_m.min(point.y_m),
-            },
-            high: Point {
-                x_m: bounds.high.x_m.max(point.x_m),
-                y_m: bounds.high.y_m.max(point.y_m),
-            },
-        })
-    }
-
-    /// Returns the distance of a point from the box along each axis, `(x, y)`, metres; 0 within.
-    fn axis_distances_m(&self, point: Point) -> (f64, f64) {
-        let distance_m = |value: f64, low: f64, high: f64| (low - value).max(value - high).max(0.0);
-        (
-            distance_m(point.x_m, self.low.x_m, self.high.x_m),
-            distance_m(point.y_m, self.low.y_m, self.high.y_m),
-        )
-    }
-
-    /// Returns the squared distance of a point from the box; 0 within.
-    fn distance_m2(&self, point: Point) -> f64 {
-        let (x_m, y_m) = self.axis_distances_m(point);
-        x_m * x_m + y_m * y_m
-    }
-
-    /// Returns whether the ray from a point in the direction of x can meet a side in the box.
-    fn is_met_by_ray(&self, point: Point) -> bool {
-        (self.low.y_m..=self.high.y_m).contains(&point.y_m) && point.x_m <= self.high.x_m
-    }
-}
-
 /// Neighbouring sides with their bounding box.
 #[derive(Debug, Clone, PartialEq)]
 struct Group {
-    bounds: Bounds,
+    bounds: BoundingBox,
     sides: Vec<Side>,
 }
 
@@ -87,7 +35,7 @@ impl Group {
     fn new(sides: &[Side]) -> Self {
         let ends = sides.iter().flat_map(|side| [side.from, side.to]);
         Self {
-            bounds: Bounds::of(ends),
+            bounds: BoundingBox::around(ends),
             sides: sides.to_vec(),
         }
     }
@@ -135,7 +83,7 @@ impl Group {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Polygon {
     groups: Vec<Group>,
-    bounds: Bounds,
+    bounds: BoundingBox,
 }
 
 impl Polygon {
@@ -150,7 +98,7 @@ impl Polygon {
         let sides: Vec<Side> = corners.iter().zip(next).map(side).collect();
         Self {
             groups: sides.chunks(GROUP_SIDES).map(Group::new).collect(),
-            bounds: Bounds::of(corners.iter().copied()),
+            bounds: BoundingBox::around(corners.iter().copied()),
         }
     }
 

@@ -13,6 +13,7 @@ use serde::Serialize;
 use tread_control::robot::RobotModel;
 
 use super::timeline::LoopInput;
+use crate::report::median;
 
 /// Gap between two samples of wheels and gyro above which a new part begins.
 pub const PART_GAP: Duration = Duration::from_secs(1);
@@ -250,12 +251,6 @@ impl Bin {
         *self = Self::default();
         Some(mean_m_s)
     }
-}
-
-/// Returns the median; 0 of nothing.
-pub fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -10,13 +10,11 @@ use tread_control::estimation::EstimatorPrior;
 use tread_control::geometry::Pose;
 
 use super::drive::RoughDrive;
-use super::run::Course;
+use super::run::{Course, SETTLES};
 use super::sensors::SensorSpec;
 use super::spec::{Deviations, Make};
 use crate::random::Random;
 
-/// Time that a robot is given to localise itself.
-const SETTLES: Duration = Duration::from_secs(2);
 /// Edge of a cell, metres: so large that segments end by time.
 const CELL_M: f64 = 100.0;
 /// Time after a change in which it may be detected.

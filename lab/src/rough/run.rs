@@ -20,8 +20,8 @@ use crate::random::Random;
 
 /// Times after the start of the mission at which the agent's estimate is read, in seconds.
 pub const ASKED_AT_S: [u64; 4] = [10, 20, 40, 60];
-/// Time before the mission in which the robot's localisation converges.
-const SETTLES: Duration = Duration::from_secs(2);
+/// Time at rest before the start, in which the robot's localisation converges.
+pub const SETTLES: Duration = Duration::from_secs(2);
 /// Speed on the courses, in metres per second.
 const SPEED_M_S: f64 = 0.6;
 /// Number of waypoints per lap of the figure-8.
@@ -105,6 +105,10 @@ pub struct Trial {
     /// Whether to compute the Cramér–Rao bound of θ, which takes about ten times as long.
     pub is_bounded: bool,
 }
+
+/// Fraction of the time beyond half the slip at the peak above which a drive belongs to the stratum
+/// of large slip.
+pub const SLIPS_MOSTLY: f64 = 0.5;
 
 /// Result of a drive.
 #[derive(Debug, Clone, Copy, PartialEq)]

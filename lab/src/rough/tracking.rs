@@ -22,13 +22,12 @@ use tread_control::tracking::{ThetaKnowledge, TrackerConfig, TrackingErrors};
 
 use super::means::Means;
 use super::plant::{Plant, STEP_S, State, Truth};
+use super::run::SETTLES;
 use super::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
 use super::spec::{Deviations, Make};
 use crate::bench::{Course, Driver, Law, LawInput};
 use crate::random::Random;
 
-/// Time at rest before the start, in which the localisation converges.
-const SETTLES: Duration = Duration::from_secs(2);
 /// Time after the start from which errors are evaluated, in seconds.
 pub const COUNTED_FROM_S: f64 = 10.0;
 /// Maximum duration of a drive relative to the plan's; a robot that takes longer counts as lost.

@@ -6,50 +6,14 @@ use tread_api::site::{Cell, Grid};
 use tread_api::terrain::TerrainRef;
 use tread_api::wire::hello::SiteDefinition;
 use tread_control::fence::Fence;
-use tread_control::geometry::Pose;
+use tread_control::geometry::{BoundingBox, Pose};
 use tread_control::robot::RobotModel;
 
-use crate::geometry::fence_of;
+use crate::geometry::{control_point, fence_of};
 
 /// Distance outside its cell up to which a robot keeps it, metres: more than the position noise, so
 /// that a path along a border does not split its segments.
 const CELL_MARGIN_M: f64 = 0.05;
-
-#[derive(Debug, Clone, Copy)]
-struct Bounds {
-    low: Point,
-    high: Point,
-}
-
-impl Bounds {
-    fn of(corners: &[Point]) -> Self {
-        let start = Self {
-            low: Point {
-                x_m: f64::INFINITY,
-                y_m: f64::INFINITY,
-            },
-            high: Point {
-                x_m: f64::NEG_INFINITY,
-                y_m: f64::NEG_INFINITY,
-            },
-        };
-        corners.iter().fold(start, |bounds, corner| Self {
-            low: Point {
-                x_m: bounds.low.x_m.min(corner.x_m),
-                y_m: bounds.low.y_m.min(corner.y_m),
-            },
-            high: Point {
-                x_m: bounds.high.x_m.max(corner.x_m),
-                y_m: bounds.high.y_m.max(corner.y_m),
-            },
-        })
-    }
-
-    fn contains(&self, point: Point) -> bool {
-        (self.low.x_m..=self.high.x_m).contains(&point.x_m)
-            && (self.low.y_m..=self.high.y_m).contains(&point.y_m)
-    }
-}
 
 /// Ground under the wheels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -65,7 +29,7 @@ pub(crate) enum GroundUnderWheels {
 pub(crate) struct SiteView {
     definition: SiteDefinition,
     fence: Fence,
-    bounds: Vec<Bounds>,
+    bounds: Vec<BoundingBox>,
     /// Indices of the terrains: highest layer first, then by identifier.
     order: Vec<usize>,
     /// Whether the fence leaves no room anywhere, regardless of the definition.
@@ -77,7 +41,10 @@ impl SiteView {
         let terrains = &definition.terrains;
         let bounds = terrains
             .iter()
-            .map(|shape| Bounds::of(shape.polygon.corners()))
+            .map(|shape| {
+                let corners = shape.polygon.corners().iter();
+                BoundingBox::around(corners.map(|corner| control_point(*corner)))
+            })
             .collect();
         let mut order: Vec<usize> = (0..terrains.len()).collect();
         order.sort_by(|&left, &right| {
@@ -142,8 +109,9 @@ impl SiteView {
     }
 
     fn terrain_at(&self, point: Point) -> Option<usize> {
+        let within = control_point(point);
         self.order.iter().copied().find(|&place| {
-            self.bounds[place].contains(point)
+            self.bounds[place].contains(within)
                 && self.definition.terrains[place].polygon.contains(point)
         })
     }

@@ -120,7 +120,7 @@ pub struct Bench<D = SimulatedDrive> {
     /// Driven path of the last mission that ended.
     pub(crate) last_driven: Option<Driven>,
     /// Cross-track error at the end of the last mission, metres.
-    pub(crate) cross_track_m: f64,
+    pub(crate) cross_track_m: Option<f64>,
     /// Writer of the recording, if enabled, and the queue of its input.
     record: Option<(RecordWriter, Notes)>,
 }
@@ -322,7 +322,7 @@ impl<D: SteppedDrive> Bench<D> {
             silence_max: None,
             prior: None,
             last_driven: None,
-            cross_track_m: f64::NAN,
+            cross_track_m: None,
             record: None,
         }
     }
@@ -611,7 +611,7 @@ impl<D: SteppedDrive> Bench<D> {
                 } => {
                     self.ended.push((job.mission, reason));
                     self.last_driven = Some(job.driven);
-                    self.cross_track_m = progress.cross_track_m;
+                    self.cross_track_m = Some(progress.cross_track_m);
                 }
                 LoopEvent::Segment(segment) => self.segments.push(segment),
                 LoopEvent::Paused { at, since, .. } => {

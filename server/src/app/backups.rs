@@ -26,6 +26,7 @@ use crate::backup::archive::{self, DATABASE_NAME, describe_authority_file, descr
 use crate::backup::manifest::{ArchivedFile, FORMAT};
 use crate::backup::{ArchiveError, Filter, Manifest, Source, folder};
 use crate::build;
+use crate::config::BYTES_PER_MIB;
 use crate::db::DbError;
 use crate::db::file::copy::{self, CopyPaths};
 use crate::file_error::FileError;
@@ -39,7 +40,6 @@ const TARGET_RESERVE_BYTES: u64 = 16 * 1024 * 1024;
 const COPY_ENDING: &str = ".backup-copy";
 /// Suffix of the lock of backups, after the name of the database.
 const LOCK_ENDING: &str = ".backup-lock";
-const BYTES_PER_MIB: u64 = 1024 * 1024;
 
 /// Reason why no backup was made.
 #[derive(Debug, thiserror::Error)]

@@ -31,6 +31,7 @@ use crate::db::alerts::AlertFilter;
 use crate::db::failure::{self, StorageFailure};
 use crate::db::{DbError, Engine};
 use crate::error_text::chain;
+use crate::metrics::SlowUseCase;
 
 /// Interval between checks of the storage.
 const CHECK_EVERY: Duration = Duration::from_secs(5);
@@ -180,6 +181,22 @@ impl Storage {
 }
 
 impl App {
+    /// Returns the name of the database's engine, and its version.
+    pub fn database_engine(&self) -> (&'static str, &str) {
+        let (engine, version) = self.db().engine();
+        (engine.name(), version)
+    }
+
+    /// Returns the schema of the database.
+    pub fn database_schema(&self) -> i64 {
+        self.db().schema()
+    }
+
+    /// Returns the use cases with slow transactions, the slowest first.
+    pub fn slow_use_cases(&self) -> Vec<SlowUseCase> {
+        self.db().metrics().slow()
+    }
+
     /// Logs that a background task failed and will be repeated; repeats are counted.
     pub(crate) fn log_failure(&self, what: &'static str, cause: &dyn std::error::Error) {
         let (now, reason) = (self.clock().elapsed(), chain(cause));

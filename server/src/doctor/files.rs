@@ -10,13 +10,12 @@ use nix::unistd::Uid;
 use tread_api::diagnosis::{Finding, NextStep};
 
 use super::DoctorInput;
-use crate::config::TlsSource;
 use crate::config::credentials::is_passed;
+use crate::config::{BYTES_PER_MIB, TlsSource};
 use crate::paths::folder_of;
 
 /// Number of bytes written to test the disk.
 const TRIED_BYTES: usize = 16 * 1_024;
-const BYTES_PER_MIB: u64 = 1_024 * 1_024;
 /// Permissions of group and others.
 const OF_OTHERS: u32 = 0o077;
 /// Permissions of others.

@@ -1,7 +1,7 @@
 //! Sends one request to a port of this machine. Over TLS it accepts every certificate, because the
 //! doctor examines the certificate itself.
 
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -12,6 +12,8 @@ use rustls::{ClientConfig, DigitallySignedStruct, SignatureScheme};
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
+
+use crate::health::reachable;
 
 /// Maximum time for a connection and its answer.
 const WAIT_MAX: Duration = Duration::from_secs(5);
@@ -43,20 +45,10 @@ impl Answer {
     }
 }
 
-/// Returns the address by which this machine itself reaches a port.
-pub(super) fn from_here(address: SocketAddr) -> SocketAddr {
-    let ip = match address.ip() {
-        IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
-        IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
-        ip @ (IpAddr::V4(_) | IpAddr::V6(_)) => ip,
-    };
-    SocketAddr::new(ip, address.port())
-}
-
 /// Requests a page; returns `None` if nothing answers in time.
 pub(super) async fn get(address: SocketAddr, is_tls: bool, path: &str) -> Option<Answer> {
     let asking = async {
-        let stream = TcpStream::connect(from_here(address)).await.ok()?;
+        let stream = TcpStream::connect(reachable(address)).await.ok()?;
         if !is_tls {
             let text = ask(stream, path).await?;
             return Some(Answer { text, leaf: None });
@@ -71,7 +63,7 @@ pub(super) async fn get(address: SocketAddr, is_tls: bool, path: &str) -> Option
 /// Begins TLS with a port, and returns the certificate that it presents.
 pub(super) async fn certificate(address: SocketAddr) -> Option<CertificateDer<'static>> {
     let asking = async {
-        let stream = TcpStream::connect(from_here(address)).await.ok()?;
+        let stream = TcpStream::connect(reachable(address)).await.ok()?;
         let (_stream, leaf) = handshake(stream).await?;
         leaf
     };
@@ -80,7 +72,7 @@ pub(super) async fn certificate(address: SocketAddr) -> Option<CertificateDer<'s
 
 /// Returns whether a program accepts connections.
 pub(super) async fn is_open(address: SocketAddr) -> bool {
-    let connecting = TcpStream::connect(from_here(address));
+    let connecting = TcpStream::connect(reachable(address));
     matches!(tokio::time::timeout(WAIT_MAX, connecting).await, Ok(Ok(_)))
 }
 

@@ -89,7 +89,7 @@ fn whole_ms(span: Duration) -> u64 {
 }
 
 fn slow_transactions(app: &App) -> SlowTransactions {
-    let slow = app.db().metrics().slow();
+    let slow = app.slow_use_cases();
     let count = slow.iter().map(|of| of.count).sum();
     let slowest = slow.into_iter().take(SLOWEST_MAX).map(|of| SlowUseCase {
         kind: of.kind.to_owned(),
@@ -237,12 +237,12 @@ pub(super) async fn status(
     Json(ServerStatus {
         version: build::VERSION.to_owned(),
         commit: build::commit().map(str::to_owned),
-        schema: app.db().schema(),
+        schema: app.database_schema(),
         uptime_ms: whole_ms(app.uptime()),
         database: {
-            let (engine, version) = app.db().engine();
+            let (engine, version) = app.database_engine();
             DatabaseStatus {
-                engine: engine.name().to_owned(),
+                engine: engine.to_owned(),
                 version: version.to_owned(),
                 standbys,
             }

@@ -27,6 +27,7 @@ use crate::backup::archive::{self, Extraction, sync_folder};
 use crate::backup::{Filter, Manifest};
 use crate::build;
 use crate::clock::Clock;
+use crate::config::BYTES_PER_MIB;
 use crate::db::Location;
 use crate::db::file::{copy, schema};
 use crate::db::lock::DatabaseLock;
@@ -40,7 +41,6 @@ const RESTORING_ENDING: &str = ".restoring";
 const REPLACED_INFIX: &str = ".before-restore-";
 /// Free space for the log of the database while it is prepared, MiB.
 const LOG_MIB: u64 = 16;
-const BYTES_PER_MIB: u64 = 1024 * 1024;
 /// Step of the progress between printed lines, per cent.
 const STEP_PERCENT: u64 = 10;
 

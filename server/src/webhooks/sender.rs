@@ -8,15 +8,14 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::Timestamp;
 use reqwest::dns::{Addrs, Name, Resolve, Resolving};
 use reqwest::{Certificate, Client, Response, StatusCode, Url, header, redirect};
-use tread_api::ids::DeliveryId;
 use tread_api::text::cleaned;
 use tread_api::webhook::{DELIVERY_HEADER, SIGNATURE_HEADER, TIMESTAMP_HEADER};
 
 use super::address::{Rules, literal};
-use super::signature;
+use super::outgoing::OutgoingDelivery;
+use super::signature::signature;
 
 /// Maximum time to resolve a host name.
 pub const RESOLVE_MAX: Duration = Duration::from_secs(3);
@@ -66,21 +65,6 @@ impl Resolve for Checked {
         let addresses: Addrs = Box::new(self.0.clone().into_iter());
         Box::pin(async move { Ok(addresses) })
     }
-}
-
-/// A delivery to be sent.
-#[derive(Clone, PartialEq, Eq)]
-pub struct OutgoingDelivery {
-    /// Identifier of the delivery.
-    pub id: DeliveryId,
-    /// URL of the webhook.
-    pub url: String,
-    /// Secret of the webhook.
-    pub secret: String,
-    /// Body, JSON.
-    pub body: String,
-    /// Time of the attempt.
-    pub at: Timestamp,
 }
 
 /// Result of an attempt.

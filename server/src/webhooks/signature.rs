@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use ring::hmac;
 
-use super::OutgoingDelivery;
+use super::outgoing::OutgoingDelivery;
 
 /// Returns the signature of a delivery, `v1=` and the HMAC in lower-case hex.
 pub fn signature(outgoing: &OutgoingDelivery) -> String {

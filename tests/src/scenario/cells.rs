@@ -23,7 +23,7 @@ use tread_lab::parallel::in_parallel;
 use tread_lab::random::Random;
 use tread_lab::report::WIDE_RATIO;
 use tread_lab::rough::drive::RoughDrive;
-use tread_lab::rough::run::Course;
+use tread_lab::rough::run::{Course, SETTLES};
 use tread_lab::rough::sensors::SensorSpec;
 use tread_lab::rough::spec::{Deviations, MAKES};
 use tread_server::config::FrictionConfig;
@@ -32,8 +32,6 @@ use uuid::Uuid;
 
 use crate::report::{Check, figure, quantile};
 
-/// Time that a robot is given to localise itself.
-const SETTLES: Duration = Duration::from_secs(2);
 /// Time that a robot drives: nearly three laps of the figure-8.
 const DRIVES: Duration = Duration::from_secs(110);
 /// Edge of a cell, metres.

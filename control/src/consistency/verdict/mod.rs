@@ -13,8 +13,9 @@ mod wheels;
 
 use super::fixes::{FixResidual, Jump};
 use super::history::{Commanded, History, Means, Span};
+use super::track::{Track, Verdict};
 use super::turn_gain::TurnGain;
-use super::{AllRepeats, Finding, Subject, Track};
+use super::{AllRepeats, Finding, Subject};
 use crate::geometry::Twist;
 use crate::robot::RobotModel;
 use axis::{Axis, Tolerance};
@@ -176,31 +177,6 @@ impl Verdicts {
             None if self.agrees[at] => Verdict::Agrees,
             None if self.agrees_at_rest[at] => Verdict::AgreesAtRest,
             None => Verdict::Nothing,
-        }
-    }
-}
-
-/// Result for one subject in one bin.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Verdict {
-    /// It contradicts; the finding becomes active once that has lasted the given number of seconds.
-    Contradicts(Finding, f64),
-    /// It contradicts, and a finding is active already.
-    StillContradicts,
-    /// It is confirmed to be right.
-    Agrees,
-    /// It agrees with a stopped robot.
-    AgreesAtRest,
-    /// There is no evidence.
-    Nothing,
-}
-
-impl Verdict {
-    /// Returns this result with a duration of 0 until the finding becomes active.
-    pub(super) fn at_once(self) -> Self {
-        match self {
-            Self::Contradicts(finding, _) => Self::Contradicts(finding, 0.0),
-            Self::StillContradicts | Self::Agrees | Self::AgreesAtRest | Self::Nothing => self,
         }
     }
 }

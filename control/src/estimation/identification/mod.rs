@@ -26,6 +26,7 @@ mod simulation;
 mod tests;
 mod wheel_noise;
 
+use super::payload::STANDING_M_S;
 use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, SensorNoise, SensorSample};
 use crate::geometry::Twist;
 use crate::measured::BodyAcceleration;
@@ -63,8 +64,6 @@ const ROLLING_M_S: f64 = 0.2;
 const CHANGES_STD_DEVS_MAX: [f64; 2] = [0.2, 0.5];
 /// Minimum number of blocks before a change of the ground is detected.
 const CHANGES_BLOCKS_MIN: u32 = 10;
-/// Rim speed of the faster side below which the robot counts as standing, metres per second.
-const STANDING_M_S: f64 = 0.02;
 /// Bandwidth of the low-pass filter of accelerations, per second.
 const SMOOTHED_PER_S: f64 = 35.0;
 /// Standard deviations of the model's error in a mean over [`COMPARED_S`]: turn rate in radians per

@@ -5,14 +5,11 @@ use std::fmt::Write as _;
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
 use tread_lab::held_out::process::Contacts;
-use tread_lab::report::{Check, Part, WIDE_RATIO};
-use tread_lab::rough::run::{Outcome, Trial};
+use tread_lab::report::{Check, Part, WIDE_RATIO, median};
+use tread_lab::rough::run::{Outcome, SLIPS_MOSTLY, Trial};
 
 /// Goal for the coverage of 95 % intervals.
 pub(crate) const COVERAGE_MIN: f64 = 0.85;
-/// Fraction of the time beyond half the slip at the peak above which a drive belongs to the stratum
-/// of large slip.
-const SLIPS_MOSTLY: f64 = 0.5;
 
 /// A drive and its result.
 pub(crate) type Drive = (Trial, Outcome);
@@ -202,9 +199,4 @@ pub(crate) fn markdown(lines: &[Line]) -> String {
         let _ = writeln!(text, "| {contacts} | {} | {torque} | {cells} |", line.name);
     }
     text
-}
-
-fn median(figures: &mut [f64]) -> f64 {
-    figures.sort_by(f64::total_cmp);
-    figures.get(figures.len() / 2).copied().unwrap_or(0.0)
 }

@@ -2,10 +2,10 @@
 
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
-use tread_lab::report::{Check, Part, Table, percent};
+use tread_lab::report::{Check, Part, Table, median, percent};
 use tread_lab::rough::run::{PARAMETERS, estimates};
 
-use super::score::{Drive, median, verdict, yes_or_no};
+use super::score::{Drive, verdict, yes_or_no};
 
 /// Coverage that each parameter must have.
 const COVERAGE_MIN: f64 = 0.9;

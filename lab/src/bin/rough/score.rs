@@ -4,8 +4,8 @@ use std::ops::RangeInclusive;
 
 use serde::Serialize;
 use tread_api::friction::{NORMAL_95, ThetaEstimate};
-use tread_lab::report::{Check, Part, Table, WIDE_RATIO, percent};
-use tread_lab::rough::run::{ASKED_AT_S, Outcome, Trial};
+use tread_lab::report::{Check, Part, Table, WIDE_RATIO, median, percent};
+use tread_lab::rough::run::{ASKED_AT_S, Outcome, SLIPS_MOSTLY, Trial};
 
 /// Goal for the coverage of a line with a single deviation and of a stratum.
 const LINE_GOAL: RangeInclusive<f64> = 0.9..=1.0;
@@ -19,9 +19,6 @@ const OVER_BOUND_GOAL: f64 = 1.5;
 const LAST: usize = ASKED_AT_S.len() - 1;
 /// Name of the line with all deviations.
 pub(crate) const POPULATION: &str = "population";
-/// Fraction of the time beyond half the slip at the peak above which a drive belongs to the stratum
-/// of large slip.
-const SLIPS_MOSTLY: f64 = 0.5;
 
 /// A drive and its result.
 pub(crate) type Drive = (Trial, Outcome);
@@ -239,9 +236,4 @@ pub(crate) fn verdict(holds: bool) -> String {
 /// Returns the half-width of the 95 % interval, relative to θ̂.
 fn half_width(said: &ThetaEstimate) -> f64 {
     NORMAL_95 * said.std_dev / said.theta
-}
-
-pub(crate) fn median(figures: &mut [f64]) -> f64 {
-    figures.sort_by(f64::total_cmp);
-    figures.get(figures.len() / 2).copied().unwrap_or(0.0)
 }

@@ -38,6 +38,38 @@ impl Area {
         },
     };
 
+    /// Returns the smallest area around some points; the one around none touches no other.
+    pub(super) fn around(points: impl IntoIterator<Item = Point>) -> Self {
+        let nothing = Self {
+            min: Point {
+                x_m: f64::INFINITY,
+                y_m: f64::INFINITY,
+            },
+            max: Point {
+                x_m: f64::NEG_INFINITY,
+                y_m: f64::NEG_INFINITY,
+            },
+        };
+        points.into_iter().fold(nothing, |area, point| Self {
+            min: Point {
+                x_m: area.min.x_m.min(point.x_m),
+                y_m: area.min.y_m.min(point.y_m),
+            },
+            max: Point {
+                x_m: area.max.x_m.max(point.x_m),
+                y_m: area.max.y_m.max(point.y_m),
+            },
+        })
+    }
+
+    /// Returns whether the areas have a point in common.
+    pub(super) fn touches(&self, other: &Self) -> bool {
+        self.min.x_m <= other.max.x_m
+            && self.max.x_m >= other.min.x_m
+            && self.min.y_m <= other.max.y_m
+            && self.max.y_m >= other.min.y_m
+    }
+
     /// Makes an area from bounds.
     ///
     /// # Errors

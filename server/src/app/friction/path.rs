@@ -242,21 +242,7 @@ pub(super) fn drawn_near<'view, 'cut>(
     drawn: &PresentTerrains<'view>,
     places: impl IntoIterator<Item = &'cut Cut>,
 ) -> NearbyTerrains<'view> {
-    let (mut min, mut max) = (
-        Point {
-            x_m: f64::INFINITY,
-            y_m: f64::INFINITY,
-        },
-        Point {
-            x_m: f64::NEG_INFINITY,
-            y_m: f64::NEG_INFINITY,
-        },
-    );
-    for Cut { middle, .. } in places {
-        (min.x_m, min.y_m) = (min.x_m.min(middle.x_m), min.y_m.min(middle.y_m));
-        (max.x_m, max.y_m) = (max.x_m.max(middle.x_m), max.y_m.max(middle.y_m));
-    }
-    drawn.near(Area { min, max })
+    drawn.near(Area::around(places.into_iter().map(|cut| cut.middle)))
 }
 
 /// Reads the map at one place after another.

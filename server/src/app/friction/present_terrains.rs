@@ -66,16 +66,8 @@ impl<'view> PresentTerrains<'view> {
 
     /// Returns the terrains whose bounding boxes touch an area.
     pub(super) fn near(&self, area: Area) -> NearbyTerrains<'view> {
-        let Area { min, max } = area;
         let touches = |terrain: &Terrain| {
-            let corners = terrain.polygon.corners();
-            let span = |of: fn(&Point) -> f64| {
-                let values = corners.iter().map(of);
-                let least = values.clone().fold(f64::INFINITY, f64::min);
-                (least, values.fold(f64::NEG_INFINITY, f64::max))
-            };
-            let (x, y) = (span(|corner| corner.x_m), span(|corner| corner.y_m));
-            x.0 <= max.x_m && x.1 >= min.x_m && y.0 <= max.y_m && y.1 >= min.y_m
+            Area::around(terrain.polygon.corners().iter().copied()).touches(&area)
         };
         let mut found: Vec<(u16, &'view Terrain)> = (1..)
             .zip(self.terrains)
