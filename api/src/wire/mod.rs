@@ -15,7 +15,7 @@ pub mod trace;
 
 use self::encoding::{CodecError, Encoding};
 use self::trace::TraceParent;
-use serde::de::DeserializeOwned;
+use serde::de::{DeserializeOwned, IgnoredAny};
 use serde::{Deserialize, Serialize};
 
 /// Major version of all payloads.
@@ -121,6 +121,14 @@ pub fn traceparent(payload: &[u8]) -> Option<TraceParent> {
 /// [`WireError`] if it is too large, of another major version, or does not parse as `T`.
 pub fn decode<T: DeserializeOwned>(payload: &[u8]) -> Result<T, WireError> {
     decode_as(Encoding::Json, payload)
+}
+
+/// Checks the version of a JSON payload, whose body may be anything.
+///
+/// # Errors
+/// [`WireError`] if it is too large, of another major version, or no envelope.
+pub fn check_version(payload: &[u8]) -> Result<(), WireError> {
+    decode::<IgnoredAny>(payload).map(|_body| ())
 }
 
 /// Decodes a payload in one pass.
@@ -229,6 +237,10 @@ mod tests {
     fn another_major_version_is_refused_by_its_number() {
         let refused = decode::<Body>(br#"{"v":1,"body":{"z":1}}"#).unwrap_err();
         assert!(matches!(refused, WireError::Version(1)));
+        assert!(check_version(br#"{"v":2,"body":[]}"#).is_ok());
+        let other = check_version(br#"{"v":3,"content":1}"#);
+        assert!(matches!(other, Err(WireError::Version(3))));
+        assert!(matches!(check_version(b""), Err(WireError::Malformed(_))));
         assert_eq!(Refusal::from(&refused).code, RefusalCode::Version);
     }
 

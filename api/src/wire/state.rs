@@ -78,8 +78,8 @@ pub struct RobotState {
 const SPEED_MAX_M_S: f64 = 100.0;
 /// Maximum magnitude of a turn rate that a state can show, radians per second.
 const TURN_RATE_MAX_RAD_S: f64 = 1_000.0;
-/// Maximum voltage that a state can show, volts.
-const VOLTAGE_MAX_V: f64 = 10_000.0;
+/// Maximum voltage of a battery, volts.
+pub const VOLTAGE_MAX_V: f64 = 1_000.0;
 /// Maximum magnitude of a heading that is wrapped to ±π, radians; a larger one has no direction left.
 const HEADING_MAX_RAD: f64 = 1.0e6;
 

@@ -9,6 +9,7 @@ mod command;
 mod error;
 pub mod rotation;
 mod session;
+mod subscriptions;
 mod tunnel;
 pub mod uploader;
 
@@ -22,19 +23,18 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use tracing::{debug, warn};
 use tread_api::enrolment::TrustId;
 use tread_api::ids::{BootId, OwnerId, RobotId, SiteId};
-use tread_api::keys::{self, Key, Verb};
-use tread_api::safety::SMALL_PAYLOAD_MAX;
+use tread_api::keys;
 use tread_api::wire::encoding::Encoding;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::ingest::{Batch, Receipt};
-use tread_api::wire::state::{FrictionReport, RobotState, ServerPulse};
-use tread_api::wire::{self, PAYLOAD_BYTES_MAX, RefusalCode};
+use tread_api::wire::state::{FrictionReport, RobotState};
+use tread_api::wire::{self, RefusalCode};
 use zenoh::Wait;
 use zenoh::handlers::FifoChannel;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
-use zenoh::query::{ConsolidationMode, Querier, Query};
+use zenoh::query::{ConsolidationMode, Querier};
 
 pub use self::command::IncomingCommand;
 pub(crate) use self::error::zenoh_failed;
@@ -304,53 +304,9 @@ impl FleetLink {
         let (site, robot) = (&identity.site, &identity.robot);
         let left = CancellationToken::new();
         let listeners = &listeners.until(&left);
-        let command_sender = listeners.commands.clone();
-        let on_event = Arc::clone(&listeners.on_event);
-        let urgent = Arc::clone(&listeners.urgent);
-        let is_left = left.clone();
-        let own_run = identity.boot.to_string();
-        let take_query = move |query: Query| {
-            // Addressed to another run of the agent: no reply.
-            let run = query.parameters().get(keys::RUN);
-            if run.is_some_and(|run| run != own_run) {
-                return;
-            }
-            on_event(LinkEvent::ServerMessage);
-            let Some(Key::Command(_, _, verb)) = Key::parse(query.key_expr().as_str()) else {
-                // A wildcard or an unknown verb: no reply, which means not delivered.
-                return;
-            };
-            let payload = query.payload().map_or(0, zenoh::bytes::ZBytes::len);
-            if payload > PAYLOAD_BYTES_MAX {
-                debug!(payload, "a command is larger than any can be");
-                return;
-            }
-            let payload = query.payload().map(|bytes| bytes.to_bytes().into_owned());
-            // A stop counts whoever sends it.
-            if let (Verb::Stop, Some(payload)) = (verb, &payload) {
-                urgent(Urgent::Stop(payload));
-            } else if is_left.is_cancelled() {
-                return;
-            }
-            let command = IncomingCommand {
-                verb,
-                payload: payload.unwrap_or_default(),
-                query,
-            };
-            // Queue full: the query is dropped, the server gets no reply and repeats it.
-            if command_sender.try_send(command).is_err() {
-                on_event(LinkEvent::CommandLost);
-            }
-        };
-        session
-            .declare_queryable(keys::commands(site, robot))
-            .complete(true)
-            .callback(take_query)
-            .background()
-            .wait()
-            .map_err(zenoh_failed("declare the commands"))?;
-        Self::listen_urgently(&session, site, robot, &listeners.urgent)?;
-        Self::listen_to_pulse(&session, site, &listeners.on_event)?;
+        subscriptions::listen_to_commands(&session, &identity, listeners, &left)?;
+        subscriptions::listen_urgently(&session, &identity, &listeners.urgent)?;
+        subscriptions::listen_to_pulse(&session, site, &listeners.on_event)?;
         // The state has priority over everything else that the robot sends, records have the least.
         let publisher = |key: String, priority: Priority| {
             let publisher = session.declare_publisher(key).priority(priority);
@@ -404,57 +360,6 @@ impl FleetLink {
             left,
             tunnel,
         })
-    }
-
-    /// Subscribes to the server's pulse, which also states which authorities robots shall trust.
-    fn listen_to_pulse(
-        session: &zenoh::Session,
-        site: &SiteId,
-        on_event: &LinkEventHandler,
-    ) -> Result<(), LinkError> {
-        let on_event = Arc::clone(on_event);
-        session
-            .declare_subscriber(keys::pulse(site))
-            .callback(move |sample| {
-                on_event(LinkEvent::ServerMessage);
-                let pulse = wire::decode::<ServerPulse>(&small(sample.payload()));
-                if let Ok(Some(trust)) = pulse.map(|pulse| pulse.trust) {
-                    on_event(LinkEvent::Trust(trust));
-                }
-            })
-            .background()
-            .wait()
-            .map_err(zenoh_failed("listen for the server's pulse"))
-    }
-
-    /// Subscribes to drive commands and limits. Only the latest counts, so each is processed in its
-    /// callback.
-    fn listen_urgently(
-        session: &zenoh::Session,
-        site: &SiteId,
-        robot: &RobotId,
-        urgent: &HandleUrgent,
-    ) -> Result<(), LinkError> {
-        let take = Arc::clone(urgent);
-        session
-            .declare_subscriber(keys::teleop(site, robot))
-            .callback(move |sample| {
-                take(Urgent::Drive(&small(sample.payload())));
-            })
-            .background()
-            .wait()
-            .map_err(zenoh_failed("listen for drive commands"))?;
-        let take = Arc::clone(urgent);
-        session
-            .declare_subscriber(keys::limits(site, robot))
-            .callback(move |sample| {
-                if let Some(Key::Limit(_, _, owner)) = Key::parse(sample.key_expr().as_str()) {
-                    take(Urgent::Limit(&owner, &small(sample.payload())));
-                }
-            })
-            .background()
-            .wait()
-            .map_err(zenoh_failed("listen for limits"))
     }
 
     /// Returns a counter that increases whenever the server becomes reachable.
@@ -583,14 +488,6 @@ impl FleetLink {
             Ok(Err(_)) | Err(_) => warn!("the session did not close in time"),
         }
     }
-}
-
-/// Returns the bytes of a small payload; those of a larger one are empty, which does not parse.
-fn small(payload: &zenoh::bytes::ZBytes) -> Vec<u8> {
-    if payload.len() > SMALL_PAYLOAD_MAX {
-        return Vec::new();
-    }
-    payload.to_bytes().into_owned()
 }
 
 #[derive(Debug, Clone, Copy)]

@@ -75,6 +75,25 @@ async fn a_server_that_falls_silent_is_left_for_the_next_and_so_is_that_one() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_of_another_wire_version_is_silent_to_a_robot() {
+    let two = Two::new();
+    let (first, second) = (two.rig.serve(), two.serve_second());
+    let (pulse, other_pulse) = (first.pulse(), second.pulse());
+    let agent = Agent::start(two.config()).unwrap();
+    Two::hellos(&two.rig.memory, 1).await;
+    let newer = first.pulse_of_another_version();
+    pulse.abort();
+    let begun = Instant::now();
+    Two::hellos(&two.memory, 1).await;
+    assert!(begun.elapsed() < MOVE_MAX, "{:?}", begun.elapsed());
+    agent.stop().await;
+    newer.abort();
+    other_pulse.abort();
+    first.stop().await;
+    second.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_server_that_is_gone_is_left_at_once_and_one_that_never_was_is_passed_over() {
     let two = Two::new();
     let second = two.serve_second();

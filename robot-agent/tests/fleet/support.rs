@@ -313,18 +313,26 @@ impl FakeServer {
 
     /// Lets the robots hear the server until the task is dropped.
     pub(crate) fn pulse(&self) -> tokio::task::JoinHandle<()> {
+        let pulse = ServerPulse {
+            trust: None,
+            server_time: jiff::Timestamp::UNIX_EPOCH,
+        };
+        self.repeat(wire::encode(&pulse).unwrap())
+    }
+
+    /// Publishes the pulse of a server of the next wire version until the task is dropped.
+    pub(crate) fn pulse_of_another_version(&self) -> tokio::task::JoinHandle<()> {
+        let version = wire::VERSION + 1;
+        self.repeat(format!(r#"{{"v":{version},"body":{{}}}}"#).into_bytes())
+    }
+
+    /// Publishes a payload as the server's pulse until the task is dropped.
+    fn repeat(&self, pulse: Vec<u8>) -> tokio::task::JoinHandle<()> {
         let (session, key) = (self.session.clone(), keys::pulse(&self.site));
         #[expect(clippy::disallowed_methods, reason = "a test has no supervisor")]
         tokio::spawn(async move {
-            let pulse = ServerPulse {
-                trust: None,
-                server_time: jiff::Timestamp::UNIX_EPOCH,
-            };
             loop {
-                session
-                    .put(&key, wire::encode(&pulse).unwrap())
-                    .await
-                    .unwrap();
+                session.put(&key, pulse.clone()).await.unwrap();
                 tokio::time::sleep(Duration::from_millis(PULSE_PERIOD_MS)).await;
             }
         })

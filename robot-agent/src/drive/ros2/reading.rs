@@ -5,6 +5,7 @@
 use std::ops::RangeInclusive;
 
 use tread_api::geometry::COORDINATE_MAX_M;
+use tread_api::wire::state::VOLTAGE_MAX_V;
 use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::localisation::FixNoise;
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
@@ -28,8 +29,6 @@ const ACCELERATION_RANGE_M_S2: RangeInclusive<f64> = -200.0..=200.0;
 const TORQUE_MAX_N_M: f64 = 1.0e5;
 /// Accepted coordinates, metres.
 const PLACE_RANGE_M: RangeInclusive<f64> = -COORDINATE_MAX_M..=COORDINATE_MAX_M;
-/// Largest accepted voltage.
-const VOLTAGE_MAX_V: f64 = 1000.0;
 /// Largest accepted standard deviation: metres (or m/s), radians.
 const DEVIATION_MAX: f64 = 10.0;
 /// Lower bounds of a fix's standard deviations, metres and radians; smaller ones are raised to
