@@ -35,7 +35,7 @@ const MEANS: [&str; 2] = [".effective_track_ratio.value", ".friction.theta"];
 /// Largest difference of a mean, as a share.
 const MEAN_DIFFERENCE_MAX: f64 = 0.02;
 /// Keys that were renamed since, by their earlier names.
-const RENAMED: [(&str, &str); 12] = [
+const RENAMED: [(&str, &str); 10] = [
     ("clear_asked_at", "clear_requested_at"),
     ("clear_asked_by", "clear_requested_by"),
     ("first_sure_alone_s", "first_known_alone_s"),
