@@ -1,5 +1,6 @@
-//! Owners of the files that root creates for the service's user. `init`, `restore`, `copy` and
-//! `migrate` run as root on a machine with packages. The server runs as another user.
+//! Owners of the files that root creates for the service's user, and the permissions of others.
+//! `init`, `restore`, `copy` and `migrate` run as root on a machine with packages. The server runs as
+//! another user.
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt as _, lchown};
@@ -9,6 +10,9 @@ use anyhow::Context as _;
 use nix::unistd::Uid;
 
 use crate::paths::folder_of;
+
+/// Mask of the permissions of group and others in a file's mode.
+pub(crate) const OF_OTHERS: u32 = 0o077;
 
 /// Owner of a file.
 #[derive(Debug, Clone, Copy)]

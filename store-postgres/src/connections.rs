@@ -17,21 +17,14 @@ use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, timeout};
 use tread_store::Outcome;
+use tread_store::timeouts::{ACQUIRE_TIMEOUT, CLOSE_TIMEOUT, ROLLBACK_TIMEOUT};
 
 use super::failure;
 
-/// Maximum time that a request waits for a connection.
-pub(super) const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum time for opening a connection.
 pub(super) const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum time for beginning a transaction: longer than [`LOCK_TIMEOUT`].
 const BEGIN_TIMEOUT: Duration = Duration::from_secs(15);
-/// Maximum time for a commit, with its sync.
-pub(super) const COMMIT_TIMEOUT: Duration = Duration::from_secs(15);
-/// Maximum time for a rollback; beyond it the connection is closed instead.
-const ROLLBACK_TIMEOUT: Duration = Duration::from_secs(2);
-/// Maximum time for connections to be returned and closed.
-const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Age at which a connection is replaced: memory of its process on the server grows with its use.
 const AGE_MAX: Duration = Duration::from_mins(30);
 /// Maximum time that the server waits for a lock, above all for the turn to write.

@@ -96,10 +96,11 @@ use tokio::sync::watch;
 use tokio::time::{Instant, timeout};
 use tread_store::failure::StorageFailure;
 use tread_store::metrics::DatabaseMetrics;
+use tread_store::timeouts::{COMMIT_TIMEOUT, DISK_TIMEOUT};
 use tread_store::{DbError, Disk};
 
 use self::begin::{BEGIN_READ, BeginWrite};
-use self::connections::{Bounds, COMMIT_TIMEOUT, Connections, TransactionConnection};
+use self::connections::{Bounds, Connections, TransactionConnection};
 pub use self::error::EngineError;
 pub use self::open::{OpenError, refuse_newer};
 pub use self::transaction::Tx;
@@ -130,8 +131,6 @@ const READER_BOUNDS: Bounds = Bounds {
     statement: Duration::from_mins(15),
     idle: Duration::from_mins(15),
 };
-/// Maximum time for the server to report the size of the database.
-const DISK_TIMEOUT: Duration = Duration::from_secs(2);
 /// PostgreSQL's code, of `check_server_epoch`, for a server that another one has taken the place of.
 const TAKEN_OVER: &str = "TR001";
 

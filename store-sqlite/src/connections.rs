@@ -19,23 +19,16 @@ use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, timeout};
 use tread_store::Outcome;
+use tread_store::timeouts::{ACQUIRE_TIMEOUT, CLOSE_TIMEOUT, ROLLBACK_TIMEOUT};
 
 use super::failure;
 
-/// Maximum time that a request waits for a connection.
-pub(super) const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum time that opening a connection waits for the thread of one that is being closed.
 const THREAD_TIMEOUT: Duration = Duration::from_secs(1);
 /// Maximum time for beginning a transaction: longer than SQLite waits for another process's lock.
 const BEGIN_TIMEOUT: Duration = Duration::from_secs(10);
-/// Maximum time for a commit, with its sync.
-pub(super) const COMMIT_TIMEOUT: Duration = Duration::from_secs(15);
-/// Maximum time for a rollback; beyond it the connection is closed instead.
-const ROLLBACK_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum number of connections with hanging threads, in addition to the working ones.
 const SPARE_MAX: u32 = 4;
-/// Maximum time for connections to be returned and closed.
-const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A pool of connections with the same options; clones share it.
 #[derive(Debug, Clone)]

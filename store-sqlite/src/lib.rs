@@ -96,9 +96,10 @@ use tokio::sync::Semaphore;
 use tokio::time::Instant;
 use tread_api::release::VERSION;
 use tread_store::metrics::DatabaseMetrics;
+use tread_store::timeouts::{COMMIT_TIMEOUT, DISK_TIMEOUT};
 use tread_store::{DbError, Disk};
 
-use self::connections::{COMMIT_TIMEOUT, Connections, TransactionConnection};
+use self::connections::{Connections, TransactionConnection};
 pub use self::error::EngineError;
 pub use self::transaction::Tx;
 use self::transaction::{Commits, DurationRecorder};
@@ -128,8 +129,6 @@ const WAL_REMAINING_DIVISOR: i64 = 8;
 const PASSES_MAX: u32 = 8;
 /// Page cache of the writer, KiB: holds the cells that robots drive over now.
 const WRITER_CACHE_KIB: u32 = 32 * 1_024;
-/// Maximum time for the operating system to report the free space of a disk.
-const DISK_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum time that SQLite waits for a lock of another process.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 

@@ -1,4 +1,5 @@
-use super::connections::ACQUIRE_TIMEOUT;
+use tread_store::timeouts::ACQUIRE_TIMEOUT;
+
 use super::*;
 
 #[test]

@@ -29,6 +29,7 @@ pub mod sites;
 pub mod stops;
 mod subject;
 pub mod sums;
+pub mod timeouts;
 pub mod transfer;
 pub mod watermarks;
 pub mod webhooks;

@@ -16,13 +16,11 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::{BLOCK_S, SensorNoise, SensorSample, ValueWithStdDev};
+use super::{BLOCK_S, ROLLING_STD_DEV, SensorNoise, SensorSample, ValueWithStdDev};
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Number of blocks of a window, over whose path the slope is assumed constant.
 const WINDOW_BLOCKS: u32 = 25;
-/// Prior mean of the rolling resistance coefficient, and also its standard deviation.
-const ROLLING_STD_DEV: f64 = 0.02;
 /// Prior standard deviation of the slope, radians.
 const SLOPE_STD_DEV_RAD: f64 = 0.05;
 /// Rim speed below which the sign of rolling resistance is uncertain, in metres per second; slower

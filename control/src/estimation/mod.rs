@@ -87,6 +87,9 @@ const SLIP_LINEAR_FIRST_MAX: f64 = 0.10;
 const RELATIVE_STD_DEV_MAX: f64 = 0.5;
 /// Minimum number of blocks of a measurement.
 const BLOCKS_MIN: u64 = 5;
+/// Prior standard deviation of the rolling resistance coefficient; the apparent mass takes it as the
+/// prior mean too.
+const ROLLING_STD_DEV: f64 = 0.02;
 /// Maximum plausible friction coefficient of one side; a sample with more torque is dropped.
 const MU_MAX: f64 = 10.0;
 /// θ in the weights of rows before the first estimate.

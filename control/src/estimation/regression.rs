@@ -13,7 +13,7 @@ use super::rows::{
     Channel, OFFSETS, ParameterMatrix, Parameters, RegressorMatrix, Regressors, Tangent, index,
 };
 use super::sums::Sums;
-use super::{BLOCKS_MIN, RELATIVE_STD_DEV_MAX, THETA_RANGE, TyrePrior};
+use super::{BLOCKS_MIN, RELATIVE_STD_DEV_MAX, ROLLING_STD_DEV, THETA_RANGE, TyrePrior};
 use crate::estimation::block::Block;
 
 /// Maximum number of iterations on the weights.
@@ -26,8 +26,6 @@ const MODEL_SHARE: f64 = 0.05;
 const SIGNIFICANCE_MIN: f64 = 6.0;
 /// Minimum number of rows for testing the assumed noise by the residuals.
 const INFLATION_ROWS: f64 = 15.0;
-/// Prior standard deviation of the rolling resistance coefficient.
-const ROLLING_STD_DEV: f64 = 0.02;
 /// Relative model error of the effect of curvature in rows on accelerations, which use the measured
 /// variation of slip within their time, and κ to second order.
 const CURVATURE_SHARE: f64 = 0.04;

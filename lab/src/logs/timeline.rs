@@ -12,7 +12,7 @@ use tread_agent::drive::ros2::assemble::{Assembler, QueuedMessage};
 use tread_agent::drive::ros2::reading::{Content, Wheels};
 use tread_agent::drive::ros2::refusal::Source;
 use tread_agent::drive::ros2::settings::{Ros2Settings, StampClock};
-use tread_agent::drive::ros2::stamps::{Arrival, Stamps};
+use tread_agent::drive::ros2::stamps::{AHEAD_MAX_NS, Arrival, Stamps};
 use tread_agent::drive::{Feedback, SensorSample, StatedNoise};
 use tread_control::measured::{WheelSpeeds, WheelTorques};
 
@@ -21,9 +21,6 @@ use super::mapping::LATE_AFTER;
 
 /// Time before the first message, so that one that is older than its record has a time.
 const LEAD: Duration = Duration::from_secs(10);
-/// Largest time by which a stamp is ahead of the recorder's clock if both are one clock,
-/// nanoseconds.
-const AHEAD_MAX_NS: i64 = 5_000_000;
 /// Interval of wheel speeds that are interpolated, seconds.
 const INTERPOLATED_S: f64 = 0.02;
 /// Intervals of wheel speeds between which they are interpolated: what the estimator bridges by

@@ -31,6 +31,7 @@ use serde::{Deserialize, Serialize};
 use tracing::{error, warn};
 
 use super::{Authority, fingerprint};
+use crate::file_owner::OF_OTHERS;
 
 /// File with the authority's certificate.
 pub const CERTIFICATE_FILE: &str = "ca.pem";
@@ -188,7 +189,7 @@ struct FileNames {
 fn load(folder: &Path, names: FileNames) -> Result<Authority, AuthorityError> {
     let (certificate, key) = (folder.join(names.certificate), folder.join(names.key));
     let mode = fs::metadata(&key).map_err(unreadable(&key))?.permissions();
-    if mode.mode() & 0o077 != 0 {
+    if mode.mode() & OF_OTHERS != 0 {
         return Err(AuthorityError::Open(key));
     }
     let key_pem = fs::read_to_string(&key).map_err(unreadable(&key))?;

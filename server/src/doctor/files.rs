@@ -12,12 +12,11 @@ use tread_api::diagnosis::{Finding, NextStep};
 use super::DoctorInput;
 use crate::config::credentials::is_passed;
 use crate::config::{BYTES_PER_MIB, TlsSource};
+use crate::file_owner::OF_OTHERS;
 use crate::paths::folder_of;
 
 /// Number of bytes written to test the disk.
 const TRIED_BYTES: usize = 16 * 1_024;
-/// Permissions of group and others.
-const OF_OTHERS: u32 = 0o077;
 /// Permissions of others.
 const OF_ALL: u32 = 0o007;
 

@@ -10,6 +10,7 @@ use reqwest::{Certificate, Url, redirect};
 
 use super::ProviderError;
 use crate::config::credentials;
+use crate::file_owner::OF_OTHERS;
 use crate::identity::claims::Claims;
 
 /// Timeout of one request to the provider. A sign-in sends up to three, within
@@ -123,7 +124,7 @@ pub(super) fn read_secret(file: &Path) -> Result<String, ProviderError> {
         cause,
     };
     let mode = std::fs::metadata(file).map_err(unreadable)?.permissions();
-    if mode.mode() & 0o077 != 0 && !credentials::is_passed(file) {
+    if mode.mode() & OF_OTHERS != 0 && !credentials::is_passed(file) {
         return Err(ProviderError::Open(file.to_owned()));
     }
     let text = std::fs::read_to_string(file).map_err(unreadable)?;

@@ -14,7 +14,7 @@ use super::settings::StampClock;
 
 /// Largest amount by which a stamp may be in the future, nanoseconds: two readings of clocks of one
 /// machine.
-const AHEAD_MAX_NS: i64 = 5_000_000;
+pub const AHEAD_MAX_NS: i64 = 5_000_000;
 /// Largest difference of two stamps that count as equal, nanoseconds.
 const SAME_NS: i64 = 20_000;
 /// Smallest age that counts as a jump of the clock instead of a delay, nanoseconds.
