@@ -123,14 +123,14 @@ pub fn claims(
         }
     });
     let nonce = Nonce::new(expected.nonce.to_owned());
-    let verified = id_token.claims(&verifier, &nonce).map_err(|error| {
+    let id_claims = id_token.claims(&verifier, &nonce).map_err(|error| {
         if matches!(error, ClaimsVerificationError::SignatureVerification(_)) {
             InvalidIdToken::Signature(error)
         } else {
             InvalidIdToken::Claims(error)
         }
     })?;
-    if let Some(hash) = verified.access_token_hash() {
+    if let Some(hash) = id_claims.access_token_hash() {
         let signed = id_token.signing_alg().ok();
         let key = id_token.signing_key(&verifier).ok();
         let own = signed.zip(key).and_then(|(algorithm, key)| {
@@ -140,12 +140,12 @@ pub fn claims(
             return Err(InvalidIdToken::AccessToken);
         }
     }
-    if let Some(party) = verified.authorized_party()
+    if let Some(party) = id_claims.authorized_party()
         && party != expected.client_id
     {
         return Err(InvalidIdToken::Party);
     }
-    let subject = verified.subject().as_str();
+    let subject = id_claims.subject().as_str();
     if subject.is_empty() || subject.chars().count() > SUBJECT_MAX {
         return Err(InvalidIdToken::Subject);
     }
