@@ -47,6 +47,8 @@ const RENAMED: [(&str, &str); 10] = [
     ("theta_sd", "theta_std_dev"),
     ("wanted_at", "requested_at"),
 ];
+/// End of the place of a step's cause.
+const CAUSE_FIELD: &str = ".cause";
 /// Causes of steps that were renamed since, by their earlier names.
 const RENAMED_CAUSES: [(&str, &str); 2] = [
     ("noted", "recorded"),
@@ -139,7 +141,7 @@ fn losses(place: &str, earlier: &Value, present: &Value, found: &mut Vec<String>
             }
         }
         _ if earlier == present => {}
-        _ if place.ends_with(".cause")
+        _ if place.ends_with(CAUSE_FIELD)
             && RENAMED_CAUSES
                 .iter()
                 .any(|(former, now)| earlier == former && present == now) => {}
