@@ -73,7 +73,7 @@ pub struct Identity {
 /// An event on the link, for counters and watches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LinkEvent {
-    /// A message of the server arrived: its pulse, or a command.
+    /// A readable message of the server arrived: its pulse, or a small command.
     ServerMessage,
     /// A command was dropped because the queue was full; the server repeats it.
     CommandLost,

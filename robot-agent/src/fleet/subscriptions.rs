@@ -48,11 +48,12 @@ pub(super) fn listen_to_commands(
             return;
         }
         let payload = query.payload().map(|bytes| bytes.to_bytes().into_owned());
-        // A server whose commands cannot be read must not keep the link alive.
-        let is_readable = |payload: &Vec<u8>| {
+        // A server whose commands cannot be read must not keep the link alive. A large command is not
+        // parsed here, because this callback must be quick; pulses keep the link alive meanwhile.
+        let is_small_and_readable = |payload: &Vec<u8>| {
             payload.len() <= SMALL_PAYLOAD_MAX && wire::check_version(payload).is_ok()
         };
-        if payload.as_ref().is_some_and(is_readable) {
+        if payload.as_ref().is_some_and(is_small_and_readable) {
             on_event(LinkEvent::ServerMessage);
         }
         // A stop counts whoever sends it.
@@ -146,8 +147,8 @@ pub(super) fn listen_urgently(
         .map_err(zenoh_failed("listen for limits"))
 }
 
-/// Log of published messages of another wire version: a warning for each version, not for each
-/// message.
+/// Log of published messages of another wire version: one warning for messages of the same version
+/// in a row.
 struct VersionLog {
     kind: &'static str,
     /// The other version of the last warning; 0 before the first one.
