@@ -65,7 +65,7 @@ impl BoundingBox {
 
     /// Returns whether a point is in the box or on its border.
     pub fn contains(&self, point: Point) -> bool {
-        (self.low.x_m..=self.high.x_m).contains(&point.x_m) && self.spans_height_of(point)
+        (self.low.x_m..=self.high.x_m).contains(&point.x_m) && self.spans_y_of(point)
     }
 
     /// Returns the distance of a point from the box along each axis, `(x, y)`, metres; 0 within.
@@ -85,10 +85,10 @@ impl BoundingBox {
 
     /// Returns whether the ray from a point in the direction of x can meet something in the box.
     pub(crate) fn is_met_by_ray(&self, point: Point) -> bool {
-        self.spans_height_of(point) && point.x_m <= self.high.x_m
+        self.spans_y_of(point) && point.x_m <= self.high.x_m
     }
 
-    fn spans_height_of(&self, point: Point) -> bool {
+    fn spans_y_of(&self, point: Point) -> bool {
         (self.low.y_m..=self.high.y_m).contains(&point.y_m)
     }
 }
