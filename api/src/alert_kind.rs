@@ -65,12 +65,17 @@ pub fn is_known(code: &AlertCode) -> bool {
         || RENAMED.iter().any(|(former, _)| *former == code)
 }
 
-/// Returns the former code of a kind; `None` if the kind was not renamed.
-pub fn former(code: &AlertCode) -> Option<AlertCode> {
-    let renamed = RENAMED
-        .iter()
-        .find(|(_, present)| *present == code.as_str());
-    renamed.and_then(|(former, _)| former.parse().ok())
+/// Returns the other code of a renamed kind: the former one for the present one, and the reverse;
+/// `None` if the kind was not renamed.
+pub fn other_code(code: &AlertCode) -> Option<AlertCode> {
+    let other = RENAMED.iter().find_map(|(former, present)| {
+        if code.as_str() == *present {
+            Some(former)
+        } else {
+            (code.as_str() == *former).then_some(present)
+        }
+    });
+    other.and_then(|other| other.parse().ok())
 }
 
 /// Deserialises the code of a report; a former code of an earlier version becomes the present one.
@@ -83,4 +88,21 @@ where
     Ok(renamed
         .and_then(|(_, present)| present.parse().ok())
         .unwrap_or(code))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_renamed_kind_has_two_codes_and_the_former_one_is_still_known() {
+        for (former, present) in RENAMED {
+            let [former, present]: [AlertCode; 2] =
+                [former, present].map(|code| code.parse().unwrap());
+            assert!(is_known(&former) && is_known(&present));
+            assert_eq!(other_code(&former).as_ref(), Some(&present));
+            assert_eq!(other_code(&present), Some(former));
+        }
+        assert_eq!(other_code(&"battery-low".parse().unwrap()), None);
+    }
 }

@@ -191,13 +191,10 @@ pub async fn interested(
     kind: &AlertCode,
     site: Option<&SiteId>,
 ) -> Result<Vec<Receiver>, EngineError> {
-    let mut receivers: Vec<Receiver> = Vec::new();
-    // A webhook that an earlier version stored has the former code of the kind.
-    for kind in [Some(kind.clone()), alert_kind::former(kind)]
-        .into_iter()
-        .flatten()
-    {
-        for receiver in interested_in(db, &kind, site).await? {
+    let mut receivers = interested_in_code(db, kind, site).await?;
+    // The alert or the webhook may be of an earlier version, with the other code of the kind.
+    if let Some(other) = alert_kind::other_code(kind) {
+        for receiver in interested_in_code(db, &other, site).await? {
             if receivers.iter().all(|known| known.id != receiver.id) {
                 receivers.push(receiver);
             }
@@ -206,7 +203,7 @@ pub async fn interested(
     Ok(receivers)
 }
 
-async fn interested_in(
+async fn interested_in_code(
     db: &mut Connection,
     kind: &AlertCode,
     site: Option<&SiteId>,
