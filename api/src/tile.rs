@@ -113,6 +113,14 @@ pub enum InvalidTile {
     TooLarge,
 }
 
+/// Codes of a square, one of each plane.
+#[derive(Clone, Copy)]
+struct Codes {
+    mean: u16,
+    std_dev: u8,
+    count: u8,
+}
+
 /// Resolution of a code before rounding, in parts of its step. Quantising first keeps rounding
 /// errors of a logarithm from moving a value to the neighbouring code.
 const PARTS_OF_A_STEP: f64 = 1.0e6;
@@ -134,17 +142,17 @@ fn parts(share: f64, steps: u16) -> u64 {
     clippy::cast_sign_loss,
     reason = "clamped to the steps of the type"
 )]
-fn codes(square: &TileSquare) -> (u16, u8, u8) {
+fn codes(square: &TileSquare) -> Codes {
     const STEP: u64 = PARTS_OF_A_STEP as u64;
     let share = |value: f64, low: f64, span: f64| (value.ln() * LOG10_E - low) / span;
     let theta = share(square.theta, THETA_LOW_LOG, THETA_SPAN_LOG);
     let std_dev = share(square.std_dev, STD_DEV_LOW_LOG, STD_DEV_SPAN_LOG);
     let count = f64::from(square.segments.max(1)).log2() * COUNT_STEPS;
-    (
-        ((parts(theta, 65_534) + STEP / 2) / STEP) as u16 + 1,
-        parts(std_dev, 255).div_ceil(STEP) as u8,
-        ((parts(count / 255.0, 255) + STEP / 2) / STEP) as u8,
-    )
+    Codes {
+        mean: ((parts(theta, 65_534) + STEP / 2) / STEP) as u16 + 1,
+        std_dev: parts(std_dev, 255).div_ceil(STEP) as u8,
+        count: ((parts(count / 255.0, 255) + STEP / 2) / STEP) as u8,
+    }
 }
 
 #[expect(
@@ -152,17 +160,17 @@ fn codes(square: &TileSquare) -> (u16, u8, u8) {
     clippy::cast_sign_loss,
     reason = "at most 2^31.9"
 )]
-fn square((mean, std_dev, count): (u16, u8, u8)) -> Option<TileSquare> {
+fn square(codes: Codes) -> Option<TileSquare> {
     let power = |low: f64, span: f64, share: f64| 10_f64.powf(low + span * share);
-    let share = f64::from(mean.checked_sub(1)?) / 65_534.0;
+    let share = f64::from(codes.mean.checked_sub(1)?) / 65_534.0;
     Some(TileSquare {
         theta: power(THETA_LOW_LOG, THETA_SPAN_LOG, share),
         std_dev: power(
             STD_DEV_LOW_LOG,
             STD_DEV_SPAN_LOG,
-            f64::from(std_dev) / 255.0,
+            f64::from(codes.std_dev) / 255.0,
         ),
-        segments: (f64::from(count) / COUNT_STEPS).exp2().round() as u32,
+        segments: (f64::from(codes.count) / COUNT_STEPS).exp2().round() as u32,
     })
 }
 
@@ -204,9 +212,9 @@ impl Tile {
         let planes = means.chunks_exact_mut(2).zip(std_devs).zip(counts);
         for (found, ((mean, std_dev), segments)) in squares.zip(planes) {
             let Some(found) = found else { continue };
-            let theta;
-            (theta, *std_dev, *segments) = codes(&found);
-            mean.copy_from_slice(&theta.to_le_bytes());
+            let codes = codes(&found);
+            mean.copy_from_slice(&codes.mean.to_le_bytes());
+            (*std_dev, *segments) = (codes.std_dev, codes.count);
         }
         bytes
     }
@@ -270,8 +278,12 @@ impl Tile {
             configuration: (!uuid.is_nil()).then(|| ConfigurationId::from_uuid(uuid)),
             normalisation: (!name.is_empty()).then(|| name.to_owned()),
             squares: squares
-                .map(|((mean, &std_dev), &segments)| {
-                    square((u16::from_le_bytes([mean[0], mean[1]]), std_dev, segments))
+                .map(|((mean, &std_dev), &count)| {
+                    square(Codes {
+                        mean: u16::from_le_bytes([mean[0], mean[1]]),
+                        std_dev,
+                        count,
+                    })
                 })
                 .collect(),
         })

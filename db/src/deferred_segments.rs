@@ -2,13 +2,13 @@
 //! known.
 
 use serde_json::value::RawValue;
-pub use tread_store::deferred_segments::{DeferredFilter, DeferredSegment, Origin};
+pub use tread_store::deferred_segments::{DeferredFilter, DeferredSegment, DeferredTimes, Origin};
 
 use super::{DbError, Tx, forward};
 
 forward! {
     deferred_segments;
-    fn put(origin: Origin, times_us: (i64, i64), measurement: &RawValue) -> bool;
+    fn put(origin: Origin, times: DeferredTimes, measurement: &RawValue) -> bool;
     fn count(robot_pk: i64) -> u64;
     fn is_any() -> bool;
     fn take(filter: DeferredFilter, limit: u32) -> Vec<DeferredSegment>;

@@ -3,6 +3,7 @@
 
 use jiff::Timestamp;
 use std::collections::HashSet;
+use std::ops::RangeInclusive;
 
 use super::{DbError, Tx, forward};
 
@@ -12,6 +13,6 @@ forward! {
     fn remove(until_pk: i64) -> (u64, HashSet<i64>);
     fn release_removed() -> Option<u64>;
     fn boots() -> HashSet<i64>;
-    fn within(boot_pk: i64, range: (i64, i64)) -> Vec<(i64, i64)>;
+    fn within(boot_pk: i64, seqs: RangeInclusive<i64>) -> Vec<(i64, i64)>;
     fn newest_seq(boot_pk: i64) -> Option<i64>;
 }

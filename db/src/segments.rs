@@ -1,5 +1,7 @@
 //! Raw measurements, in the order of their commits.
 
+use std::ops::RangeInclusive;
+
 use jiff::Timestamp;
 use tread_api::friction::StoredSegment;
 pub use tread_store::segments::{
@@ -19,7 +21,7 @@ forward! {
     fn first_since(at: Timestamp) -> Option<i64>;
     fn of_site(cursor: SiteCursor, limit: u32) -> Vec<KeyedSegment>;
     fn after(after: i64, limit: u32) -> Vec<KeyedSegment>;
-    fn of_all_sites(range: (i64, i64), limit: u32) -> Vec<(i64, StoredSegment)>;
+    fn of_all_sites(keys: RangeInclusive<i64>, limit: u32) -> Vec<(i64, StoredSegment)>;
 }
 
 /// Returns all measurements of a robot after a cursor, in the order of their commits.

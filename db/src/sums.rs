@@ -1,6 +1,7 @@
 //! Sums of measurements per cell, ground, robot, configuration and hour of measuring, up to the
 //! watermark of each robot ([`super::watermarks`]).
 
+use tread_api::site::Cell;
 use tread_store::friction::Sums;
 pub use tread_store::sums::{StoredHour, SumKey, SumRow};
 use tread_store::withdrawals::Hours;
@@ -10,9 +11,9 @@ use super::{DbError, Tx, forward};
 forward! {
     sums;
     fn each(take: impl FnMut(SumRow)) -> ();
-    fn of_block(site_pk: i64, block: (i32, i32), take: impl FnMut(SumRow)) -> ();
+    fn of_block(site_pk: i64, cell: Cell, take: impl FnMut(SumRow)) -> ();
     fn unmerged(limit: u32) -> Vec<StoredHour>;
-    fn of_hour(hour: (i64, i64), limit: usize) -> Vec<SumRow>;
+    fn of_hour(hour: StoredHour, limit: usize) -> Vec<SumRow>;
     fn remove(key: &SumKey) -> bool;
     fn remove_hours(robot_pk: i64, hours: Hours) -> u64;
 }

@@ -3,6 +3,8 @@
 //! An alert is raised as long as its cause lasts; the server records its begin and end. Continuous
 //! values have two bounds (hysteresis), so that an alert does not flicker.
 
+use std::ops::Range;
+
 use tread_api::ids::AlertCode;
 use tread_api::robot::{ALERT_TEXT_MAX, AlertReport, OutboxStatus, Severity};
 use tread_control::consistency::{Consequence, Finding, Findings, Kind, Subject};
@@ -20,9 +22,9 @@ use crate::drive::ros2::refusal::{Counts, DropMonitor, Source};
 use crate::outbox::OutboxDamage;
 
 /// Charge below which the battery is low, and charge above which it no longer is.
-const BATTERY_LOW: (f64, f64) = (0.20, 0.25);
+const BATTERY_LOW: Range<f64> = 0.20..0.25;
 /// Charge below which the battery is critical, and charge above which it no longer is.
-const BATTERY_CRITICAL: (f64, f64) = (0.05, 0.08);
+const BATTERY_CRITICAL: Range<f64> = 0.05..0.08;
 /// Number of waiting records above which an alert is raised, and below which it ends.
 const OUTBOX_LONG: (u64, u64) = (50_000, 25_000);
 
@@ -62,9 +64,9 @@ pub(crate) struct Alerts {
     foreign_commands: ForeignCommands,
 }
 
-/// Whether a value counts as below the bound of the present state.
-fn is_below<T: PartialOrd + Copy>(value: T, is_so: bool, (enter, leave): (T, T)) -> bool {
-    if is_so { value < leave } else { value < enter }
+/// Whether a value counts as low: below both bounds it does, and between them if it did before.
+fn is_below(value: f64, is_so: bool, Range { start, end }: Range<f64>) -> bool {
+    value < if is_so { end } else { start }
 }
 
 fn alert(code: &str, severity: Severity, text: String) -> Option<AlertReport> {

@@ -159,7 +159,7 @@ impl Online {
             Ok(Attempt::Reached(link)) => Arc::from(link),
             Ok(Attempt::Failed { is_distrusted }) => {
                 let now = self.dispatcher.clock.monotonic();
-                let pause = links.servers.failed((began, now), is_distrusted);
+                let pause = links.servers.failed(&(began..now), is_distrusted);
                 return self.rest(&mut links.membership, pause).await;
             }
             Err(cause) => {
@@ -169,7 +169,7 @@ impl Online {
                 );
                 // It is of this machine, and no fault of the server.
                 let now = self.dispatcher.clock.monotonic();
-                let pause = links.servers.failed((now, now), false);
+                let pause = links.servers.failed(&(now..now), false);
                 let pause = pause.max(LINK_FAILED_REST);
                 return self.rest(&mut links.membership, pause).await;
             }
@@ -249,7 +249,7 @@ impl Online {
                     // Its own turn shows it.
                     Err(_) => false,
                 };
-                parallel.failed((began, now()), is_distrusted);
+                parallel.failed(&(began..now()), is_distrusted);
             }
         });
         let mut parallel: FuturesUnordered<_> = parallel.collect();

@@ -4,6 +4,7 @@
 //! partitions, and retention, which drops them as a whole, keeps values little longer than it must. The
 //! ledger ([`super::segment_ranges`]) says which measurements there are; values of others are never read.
 
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use jiff::SignedDuration;
@@ -24,11 +25,12 @@ const SNAPSHOT_MAX: Duration = Duration::from_mins(9);
 /// Maximum time for which the drop of a partition waits for readers; others wait behind it.
 const LOCK_TIMEOUT: &str = "SET LOCAL lock_timeout = '1s'";
 
-/// Creates the partitions that keys from `first` to `last` need, of which all earlier ones have theirs.
+/// Creates the partitions that these keys need, of which all earlier ones have theirs.
 pub(super) async fn prepare(
     db: &mut Connection,
-    (first, last): (i64, i64),
+    keys: RangeInclusive<i64>,
 ) -> Result<(), EngineError> {
+    let (first, last) = keys.into_inner();
     let end = sqlx::query_scalar!(
         "SELECT last_pk FROM segment_partitions ORDER BY first_pk DESC LIMIT 1"
     );
@@ -39,8 +41,9 @@ pub(super) async fn prepare(
     let count = keys_of_span(db).await?.clamp(KEYS_MIN, KEYS_MAX);
     let mut next = end.map_or(first, |end| end + 1);
     while next <= last {
-        add(db, (next, next.saturating_add(count) - 1)).await?;
-        next = next.saturating_add(count);
+        let end = next.saturating_add(count) - 1;
+        add(db, next..=end).await?;
+        next = end + 1;
     }
     Ok(())
 }
@@ -61,7 +64,8 @@ async fn keys_of_span(db: &mut Connection) -> Result<i64, EngineError> {
 }
 
 /// Creates a partition. It is attached after its creation, which does not wait for readers.
-pub(super) async fn add(db: &mut Connection, (first, last): (i64, i64)) -> Result<(), EngineError> {
+pub(super) async fn add(db: &mut Connection, keys: RangeInclusive<i64>) -> Result<(), EngineError> {
+    let (first, last) = keys.into_inner();
     let end = last.saturating_add(1);
     for statement in [
         format!(

@@ -27,7 +27,7 @@ pub async fn insert(
         first: last + 1,
         last: last.saturating_add_unsigned(segments.len() as u64),
     };
-    partitions::prepare(db, (added.first, added.last)).await?;
+    partitions::prepare(db, added.first..=added.last).await?;
     insert_values(db, last + 1, segments).await?;
     Ok(added)
 }

@@ -689,11 +689,12 @@ async fn deferred_segments_are_the_same() {
             site_pk: 1,
             robot_pk: 1,
         };
-        assert!(both!(both, deferred_segments::put(origin(4), (1, 2), &raw)));
-        assert!(!both!(
-            both,
-            deferred_segments::put(origin(4), (1, 2), &raw)
-        ));
+        let times = deferred_segments::DeferredTimes {
+            ended_at: at(1),
+            received_at: at(2),
+        };
+        assert!(both!(both, deferred_segments::put(origin(4), times, &raw)));
+        assert!(!both!(both, deferred_segments::put(origin(4), times, &raw)));
         both!(both, deferred_segments::count(1));
     })
     .await;

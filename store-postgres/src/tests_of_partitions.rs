@@ -94,8 +94,8 @@ async fn removed_measurements_leave_the_lists_at_once_and_the_disk_with_their_pa
         assert_eq!(partitions(database).await, [], "none without measurements");
         assert_eq!(release(&db).await, Some(0));
         let mut tx = db.write("db").await.unwrap();
-        partitions::add(&mut tx, (1, 3)).await.unwrap();
-        partitions::add(&mut tx, (4, 9)).await.unwrap();
+        partitions::add(&mut tx, 1..=3).await.unwrap();
+        partitions::add(&mut tx, 4..=9).await.unwrap();
         tx.commit().await.unwrap();
         // One upload for all partitions, and for one that is created for it.
         upload(&db, 12, at(1)).await;
@@ -113,10 +113,7 @@ async fn removed_measurements_leave_the_lists_at_once_and_the_disk_with_their_pa
         assert_eq!(partitions(database).await, [created]);
         assert_eq!(keys(&db).await, [10, 11, 12]);
         let mut tx = db.read("db").await.unwrap();
-        assert_eq!(
-            removed::within(&mut tx, 1, (1, 99)).await.unwrap(),
-            [(1, 9)]
-        );
+        assert_eq!(removed::within(&mut tx, 1, 1..=99).await.unwrap(), [(1, 9)]);
         drop(tx);
         upload(&db, 2, at(2)).await;
         assert_eq!(keys(&db).await, [10, 11, 12, 13, 14]);
@@ -132,7 +129,7 @@ async fn a_reader_delays_the_drop_of_a_partition_and_loses_nothing() {
         database.run(NAMED).await;
         let db = database.open().await;
         let mut tx = db.write("db").await.unwrap();
-        partitions::add(&mut tx, (1, 3)).await.unwrap();
+        partitions::add(&mut tx, 1..=3).await.unwrap();
         tx.commit().await.unwrap();
         upload(&db, 6, at(1)).await;
         let mut reader = db.read("db").await.unwrap();
@@ -175,7 +172,7 @@ async fn a_partition_is_as_wide_as_the_measurements_of_a_week() {
         }
         let mut tx = db.write("db").await.unwrap();
         let next = 9 * 2_000_000 + 1;
-        partitions::prepare(&mut tx, (next, next)).await.unwrap();
+        partitions::prepare(&mut tx, next..=next).await.unwrap();
         tx.commit().await.unwrap();
         // From the second day on.
         let width = 8 * 2_000_000;

@@ -157,7 +157,7 @@ async fn measurements_are_stored_listed_and_removed_as_by_the_other_engine() {
                 both!(theirs, ours, segments::list(site_pk, &filter, 50));
                 both!(theirs, ours, segments::extent(site_pk, &filter));
             }
-            both!(theirs, ours, segments::of_all_sites((3, 40), 30));
+            both!(theirs, ours, segments::of_all_sites(4..=40, 30));
             let since = Timestamp::from_second(4).unwrap();
             both!(theirs, ours, segments::first_since(since));
             let (robot_pk, site_pk, after) = (1, 1, 4);
@@ -180,14 +180,14 @@ async fn measurements_are_stored_listed_and_removed_as_by_the_other_engine() {
                     both!(theirs, ours, removed::remove(until));
                     both!(theirs, ours, removed::boots());
                     for boot_pk in [1, 2] {
-                        both!(theirs, ours, removed::within(boot_pk, (3, 50)));
+                        both!(theirs, ours, removed::within(boot_pk, 3..=50));
                         both!(theirs, ours, removed::newest_seq(boot_pk));
-                        both!(theirs, ours, segment_ranges::within(boot_pk, (3, 50)));
+                        both!(theirs, ours, segment_ranges::within(boot_pk, 3..=50));
                         both!(theirs, ours, segment_ranges::newest_seq(boot_pk));
                     }
                     let before = Timestamp::from_second(5).unwrap();
                     both!(theirs, ours, removed::last_before(before, until + 9));
-                    both!(theirs, ours, segments::of_all_sites((0, i64::MAX), 300));
+                    both!(theirs, ours, segments::of_all_sites(1..=i64::MAX, 300));
                 }
             }
         }

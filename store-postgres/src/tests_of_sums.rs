@@ -249,7 +249,7 @@ async fn hours_to_be_merged_are_listed_robot_by_robot() {
             };
             assert!(listed.iter().all(|hour| hour.horizons == horizons));
             assert_eq!(unmerged(&mut tx, 3).await.unwrap(), listed[..3]);
-            let of_one = of_hour(&mut tx, (1, 24), 10).await.unwrap();
+            let of_one = of_hour(&mut tx, listed[1], 10).await.unwrap();
             assert_eq!(of_one.len(), 1);
             assert!(remove(&mut tx, &of_one[0].key).await.unwrap());
             assert!(!remove(&mut tx, &of_one[0].key).await.unwrap());

@@ -84,7 +84,7 @@ pub async fn insert(db: &mut Connection, table: &Table, rows: &[Row]) -> Result<
         && let ([Value::Integer(first)], [Value::Integer(last)]) =
             (&*table.key_of(first), &*table.key_of(last))
     {
-        partitions::prepare(db, (*first, *last)).await?;
+        partitions::prepare(db, *first..=*last).await?;
     }
     let all: Vec<usize> = (0..table.columns.len()).collect();
     let width = i16::try_from(all.len()).map_err(|_too_many| EngineError::DoesNotFit("table"))?;

@@ -3,15 +3,15 @@
 
 use serde_json::value::RawValue;
 use tread_store::RecordKey;
-pub use tread_store::deferred_segments::{DeferredFilter, DeferredSegment, Origin};
+pub use tread_store::deferred_segments::{DeferredFilter, DeferredSegment, DeferredTimes, Origin};
 
-use super::{Connection, EngineError, from_json, unsigned};
+use super::{Connection, EngineError, from_json, to_us, unsigned};
 
 /// Defers a segment; `false` if it is deferred or on the map already.
 pub async fn put(
     db: &mut Connection,
     origin: Origin,
-    (ended_at_us, received_at_us): (i64, i64),
+    times: DeferredTimes,
     measurement: &RawValue,
 ) -> Result<bool, EngineError> {
     let Origin {
@@ -34,8 +34,8 @@ pub async fn put(
         seq,
         site_pk,
         robot_pk,
-        ended_at_us,
-        received_at_us,
+        to_us(times.ended_at),
+        to_us(times.received_at),
         text,
     )
     .execute(db)

@@ -2,6 +2,7 @@
 //! as ranges.
 
 use std::collections::HashSet;
+use std::ops::RangeInclusive;
 
 use futures_util::TryStreamExt as _;
 use jiff::Timestamp;
@@ -42,7 +43,7 @@ pub async fn remove(
     for range in ranges.fetch_all(&mut *db).await? {
         let last = range.last_pk.min(until_pk);
         removed += (last - range.first_pk).unsigned_abs() + 1;
-        let seqs = (range.first_seq, range.first_seq + (last - range.first_pk));
+        let seqs = range.first_seq..=range.first_seq + (last - range.first_pk);
         record(db, range.boot_pk, seqs).await?;
         boots.insert(range.boot_pk);
     }
@@ -69,8 +70,9 @@ pub async fn remove(
 async fn record(
     db: &mut Connection,
     boot_pk: i64,
-    (mut from, mut to): (i64, i64),
+    seqs: RangeInclusive<i64>,
 ) -> Result<(), EngineError> {
+    let (mut from, mut to) = seqs.into_inner();
     let touched = sqlx::query!(
         r#"DELETE FROM segments_removed
            WHERE boot_pk = $1 AND from_seq <= CAST($3 AS BIGINT) + 1
@@ -105,8 +107,9 @@ pub async fn boots(db: &mut Connection) -> Result<HashSet<i64>, EngineError> {
 pub async fn within(
     db: &mut Connection,
     boot_pk: i64,
-    (from, to): (i64, i64),
+    seqs: RangeInclusive<i64>,
 ) -> Result<Vec<(i64, i64)>, EngineError> {
+    let (from, to) = seqs.into_inner();
     let rows = sqlx::query!(
         "SELECT from_seq, to_seq FROM segments_removed WHERE boot_pk = $1 AND from_seq <= $2
          ORDER BY from_seq DESC",

@@ -2,6 +2,7 @@
 //! everything but their values. A measurement that is sent again lies in one of them.
 
 use std::collections::HashMap;
+use std::ops::RangeInclusive;
 
 use futures_util::future::ready;
 use futures_util::{Stream, TryStreamExt as _};
@@ -119,8 +120,9 @@ pub async fn first_since(db: &mut Connection, at: Timestamp) -> Result<Option<i6
 pub async fn within(
     db: &mut Connection,
     boot_pk: i64,
-    (from, to): (i64, i64),
+    seqs: RangeInclusive<i64>,
 ) -> Result<Vec<(i64, i64)>, EngineError> {
+    let (from, to) = seqs.into_inner();
     let rows = sqlx::query!(
         "SELECT first_seq, last_seq FROM segment_ranges WHERE boot_pk = $1 AND first_seq <= $2
          ORDER BY first_seq DESC",

@@ -3,6 +3,8 @@
 //! Their values have a table of typed columns; what the measurements of a range have in common is in
 //! the ledger ([`super::segment_ranges`]).
 
+use std::ops::RangeInclusive;
+
 use futures_util::{Stream, StreamExt as _};
 use jiff::Timestamp;
 use tread_api::friction::{Information, Segment, StoredSegment, ThetaErrors};
@@ -267,21 +269,23 @@ pub async fn of_site(
     rows.into_iter().map(KeyedSegment::try_from).collect()
 }
 
-/// Returns at most `limit` measurements of all sites in the order of their commits, after a key and up
-/// to another one, each with the key of its site.
+/// Returns at most `limit` measurements of all sites in a range of keys, in the order of their commits,
+/// each with the key of its site.
 pub async fn of_all_sites(
     db: &mut Connection,
-    (after, until): (i64, i64),
+    keys: RangeInclusive<i64>,
     limit: u32,
 ) -> Result<Vec<(i64, StoredSegment)>, EngineError> {
+    let (first, last) = keys.into_inner();
+    let after = first - 1;
     let rows = measurements!(
         "AND segment_ranges.first_pk <= $3",
         after,
         i64::from(limit),
-        until
+        last
     );
     let rows = rows.fetch_all(db).await?;
-    let wanted = rows.into_iter().take_while(|raw| raw.pk <= until);
+    let wanted = rows.into_iter().take_while(|raw| raw.pk <= last);
     wanted
         .map(|raw| Ok((raw.site_pk, raw.try_into()?)))
         .collect()

@@ -2,6 +2,7 @@
 //! watermark of each robot ([`super::watermarks`]).
 
 use futures_util::TryStreamExt as _;
+use tread_api::site::Cell;
 pub use tread_store::sums::{StoredHour, SumKey, SumRow};
 use tread_store::withdrawals::Hours;
 
@@ -29,12 +30,12 @@ pub async fn each(db: &mut Connection, mut take: impl FnMut(SumRow)) -> Result<(
     Ok(())
 }
 
-/// Calls `take` with every sum of a block of a site's cells, given by its row and column, in no
+/// Calls `take` with every sum of a block of 64 × 64 cells of a site, given by one of these cells, in no
 /// particular order, one at a time.
 pub async fn of_block(
     db: &mut Connection,
     site_pk: i64,
-    (row, column): (i32, i32),
+    cell: Cell,
     mut take: impl FnMut(SumRow),
 ) -> Result<(), EngineError> {
     let mut rows = sqlx::query_as!(
@@ -50,8 +51,8 @@ pub async fn of_block(
                pass_at_us, robot_error_hi, robot_error_lo, tyre_error_hi, tyre_error_lo
            FROM cell_sums WHERE site_pk = $1 AND iy >> 6 = $2 AND ix >> 6 = $3"#,
         site_pk,
-        i64::from(row),
-        i64::from(column),
+        i64::from(cell.iy >> 6),
+        i64::from(cell.ix >> 6),
     )
     .fetch(db);
     while let Some(raw) = rows.try_next().await? {
@@ -63,7 +64,7 @@ pub async fn of_block(
 /// Returns at most `limit` sums of one robot and hour, in the order of the table.
 pub async fn of_hour(
     db: &mut Connection,
-    (robot_pk, epoch_h): (i64, i64),
+    hour: StoredHour,
     limit: usize,
 ) -> Result<Vec<SumRow>, EngineError> {
     let limit = i64::try_from(limit).unwrap_or(i64::MAX);
@@ -79,8 +80,8 @@ pub async fn of_hour(
            FROM cell_sums WHERE robot_pk = $1 AND epoch_h = $2
            ORDER BY iy, ix, terrain, terrain_revision, grid_revision, site_pk, configuration_pk
            LIMIT $3"#,
-        robot_pk,
-        epoch_h,
+        hour.robot_pk,
+        hour.epoch_h,
         i64::from(limit),
     )
     .fetch_all(db)

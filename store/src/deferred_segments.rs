@@ -1,5 +1,6 @@
 //! Segments that wait for the time of their robot.
 
+use jiff::Timestamp;
 use tread_api::friction::Segment;
 
 use crate::RecordKey;
@@ -20,6 +21,15 @@ pub struct DeferredFilter {
     pub boot_pk: i64,
     /// Only those that ended at this time of its robot's clock, or before, microseconds since 1970.
     pub ended_until_us: i64,
+}
+
+/// Times of a segment that is deferred.
+#[derive(Debug, Clone, Copy)]
+pub struct DeferredTimes {
+    /// Its end, by its robot's clock.
+    pub ended_at: Timestamp,
+    /// Its receipt, by the server's clock.
+    pub received_at: Timestamp,
 }
 
 /// Origin of a segment.

@@ -34,6 +34,13 @@ const LOG_TAIL_LINES: usize = 60;
 /// Half of its side, metres.
 const GROUND_HALF_M: f64 = 500.0;
 
+/// Addresses of a server, and its network in a pair.
+struct ServerPlace<'fleet> {
+    http: SocketAddr,
+    zenoh: SocketAddr,
+    network: Option<&'fleet Network>,
+}
+
 /// A running fleet; everything ends when it is dropped.
 #[derive(Debug)]
 pub struct Fleet {
@@ -394,8 +401,7 @@ impl Fleet {
     /// # Panics
     /// If it does not get ready.
     pub async fn start_server(&mut self) {
-        let place = (self.http, self.zenoh, self.network.as_ref());
-        self.server = Some(self.server_process(self.server_name, place));
+        self.server = Some(self.server_process(self.server_name, self.place()));
         let log = self.folder.path().join(format!("{}.log", self.server_name));
         let look = || async {
             let ready = self.rest.call(reqwest::Method::GET, "/readyz", None).await;
@@ -407,11 +413,23 @@ impl Fleet {
         _ = eventually("the server is ready", SHORT, look, Result::is_ok).await;
     }
 
-    /// Starts the process of a server with these addresses, and the network of one of a pair.
+    fn place(&self) -> ServerPlace<'_> {
+        ServerPlace {
+            http: self.http,
+            zenoh: self.zenoh,
+            network: self.network.as_ref(),
+        }
+    }
+
+    /// Starts the process of a server.
     fn server_process(
         &self,
         name: &str,
-        (http, zenoh, network): (SocketAddr, SocketAddr, Option<&Network>),
+        ServerPlace {
+            http,
+            zenoh,
+            network,
+        }: ServerPlace<'_>,
     ) -> Process {
         let database = match network {
             Some(network) => self.database.reached_at(network.database.address()),

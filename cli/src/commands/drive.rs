@@ -84,8 +84,10 @@ impl Drop for RawTerminal {
 /// Effect of a key.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum KeyEffect {
-    /// Fractions of the full speed and of the full yaw rate, -1 to 1.
-    Move(f64, f64),
+    /// Fraction of the full speed, -1 to 1.
+    Linear(f64),
+    /// Fraction of the full yaw rate, -1 to 1.
+    Angular(f64),
     Stop,
     Quit,
     Nothing,
@@ -106,10 +108,10 @@ fn key_effect(key: KeyEvent) -> KeyEffect {
         };
     }
     match key.code {
-        KeyCode::Up | KeyCode::Char('w' | 'W') => KeyEffect::Move(1.0, 0.0),
-        KeyCode::Down | KeyCode::Char('s' | 'S') => KeyEffect::Move(-1.0, 0.0),
-        KeyCode::Left | KeyCode::Char('a' | 'A') => KeyEffect::Move(0.0, 1.0),
-        KeyCode::Right | KeyCode::Char('d' | 'D') => KeyEffect::Move(0.0, -1.0),
+        KeyCode::Up | KeyCode::Char('w' | 'W') => KeyEffect::Linear(1.0),
+        KeyCode::Down | KeyCode::Char('s' | 'S') => KeyEffect::Linear(-1.0),
+        KeyCode::Left | KeyCode::Char('a' | 'A') => KeyEffect::Angular(1.0),
+        KeyCode::Right | KeyCode::Char('d' | 'D') => KeyEffect::Angular(-1.0),
         KeyCode::Char(' ' | 'x' | 'X') => KeyEffect::Stop,
         KeyCode::Char('q' | 'Q') | KeyCode::Esc => KeyEffect::Quit,
         _ => KeyEffect::Nothing,
@@ -124,14 +126,6 @@ struct Keys {
 }
 
 impl Keys {
-    fn press(&mut self, (linear, angular): (f64, f64), now: Instant) {
-        if linear == 0.0 {
-            self.angular = Some((angular, now));
-        } else {
-            self.linear = Some((linear, now));
-        }
-    }
-
     fn shares(&self, now: Instant) -> (f64, f64) {
         let share = |key: Option<(f64, Instant)>| {
             let held = key.filter(|(_, at)| now.saturating_duration_since(*at) < KEY_HOLDS);
@@ -248,7 +242,8 @@ impl Driving<'_> {
     /// Handles a key; returns false to quit.
     async fn press(&mut self, socket: &mut Socket, key: KeyEvent) -> anyhow::Result<bool> {
         match key_effect(key) {
-            KeyEffect::Move(linear, angular) => self.keys.press((linear, angular), Instant::now()),
+            KeyEffect::Linear(share) => self.keys.linear = Some((share, Instant::now())),
+            KeyEffect::Angular(share) => self.keys.angular = Some((share, Instant::now())),
             KeyEffect::Stop => {
                 self.keys = Keys::default();
                 let words = StopReason {
@@ -406,8 +401,8 @@ mod tests {
     fn keys_drive_for_a_moment_and_both_ways_at_once() {
         let (mut keys, start) = (Keys::default(), Instant::now());
         assert_eq!(keys.shares(start), (0.0, 0.0));
-        keys.press((1.0, 0.0), start);
-        keys.press((0.0, -1.0), start + KEY_HOLDS / 2);
+        keys.linear = Some((1.0, start));
+        keys.angular = Some((-1.0, start + KEY_HOLDS / 2));
         assert_eq!(keys.shares(start + KEY_HOLDS / 2), (1.0, -1.0));
         assert_eq!(keys.shares(start + KEY_HOLDS), (0.0, -1.0));
         assert_eq!(keys.shares(start + 2 * KEY_HOLDS), (0.0, 0.0));
@@ -415,18 +410,15 @@ mod tests {
 
     #[test]
     fn every_key_means_what_the_help_says() {
-        assert_eq!(key_effect(key(KeyCode::Up)), KeyEffect::Move(1.0, 0.0));
-        assert_eq!(
-            key_effect(key(KeyCode::Char('a'))),
-            KeyEffect::Move(0.0, 1.0)
-        );
+        assert_eq!(key_effect(key(KeyCode::Up)), KeyEffect::Linear(1.0));
+        assert_eq!(key_effect(key(KeyCode::Char('a'))), KeyEffect::Angular(1.0));
         assert_eq!(key_effect(key(KeyCode::Char(' '))), KeyEffect::Stop);
         assert!(HELP.contains("space or x stops and latches"));
         assert_eq!(key_effect(key(KeyCode::Char('x'))), KeyEffect::Stop);
         assert_eq!(key_effect(key(KeyCode::Esc)), KeyEffect::Quit);
         assert_eq!(
             key_effect(key(KeyCode::Char('d'))),
-            KeyEffect::Move(0.0, -1.0)
+            KeyEffect::Angular(-1.0)
         );
         let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
         assert_eq!(key_effect(control_c), KeyEffect::Quit);

@@ -207,14 +207,7 @@ impl LongitudinalFilter {
             left_m_s.max(right_m_s) < STANDING_M_S && gyro_rad_s.abs() < STANDING_RAD_S;
         self.standing = if is_standing { self.standing + 1 } else { 0 };
         if step.usable >= count {
-            rows[0] = self.wheels(
-                &step,
-                (forward_m_s2, gained_m_s2),
-                gyro_rad_s,
-                model,
-                noise,
-                bound,
-            );
+            rows[0] = self.wheels(&step, gained_m_s2, model, noise, bound);
         }
         if self.standing >= STANDING_STEPS {
             rows[1] = Some(self.observe(SpeedMeasurement {
@@ -288,18 +281,20 @@ impl LongitudinalFilter {
             .min(UNKNOWN_M2_S2);
     }
 
-    /// Updates the filter by the wheel speeds of a step, and returns the innovation as a row; None
-    /// if a wheel may slip beyond the valid range.
+    /// Updates the filter by the wheel speeds of a step, in which the acceleration is greater by
+    /// `gained_m_s2` than in the last step, and returns the innovation as a row; None if a wheel may
+    /// slip beyond the valid range.
     fn wheels(
         &mut self,
         step: &Step,
-        (forward_m_s2, gained_m_s2): (f64, f64),
-        gyro_rad_s: f64,
+        gained_m_s2: f64,
         model: &RobotModel,
         noise: &SensorNoise,
         bound: &SlipBound,
     ) -> Option<Row> {
         let count = step.samples;
+        let forward_m_s2 = step.forward_m_s2 / count;
+        let gyro_rad_s = step.gyro_rad_s / count;
         let slower_m_s = step.slower_m_s / count;
         let rim_difference_m_s = step.rim_difference_m_s / count;
         let turn_m_s = model.track_width_m() * gyro_rad_s;

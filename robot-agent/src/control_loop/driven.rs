@@ -15,7 +15,7 @@ use tread_control::gate::GateCause;
 use tread_control::geometry::Point;
 
 use self::stretch::Stretch;
-use super::gain::{Gain, GroundRecord};
+use super::gain::{Gain, GainTick, GroundRecord};
 use super::surface::Comparison;
 
 /// Initial distance between two recorded points, metres.
@@ -165,8 +165,12 @@ impl Driven {
             self.add_point(PathPosition { at, time_s });
         }
         self.add_theta(tick);
-        self.gain
-            .add(&tick.ground, (tick.dt_s, driven_m), self.duration_s);
+        let gain_tick = GainTick {
+            dt_s: tick.dt_s,
+            driven_m,
+            since_start_s: self.duration_s,
+        };
+        self.gain.add(&tick.ground, gain_tick);
     }
 
     fn add_point(&mut self, passed: PathPosition) {

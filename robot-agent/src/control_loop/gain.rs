@@ -19,6 +19,15 @@ pub(crate) struct GroundRecord {
     pub(crate) measured: Option<ThetaKnowledge>,
 }
 
+/// Duration of a tick, and the distance driven in it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct GainTick {
+    pub(super) dt_s: f64,
+    pub(super) driven_m: f64,
+    /// Time since the mission's start.
+    pub(super) since_start_s: f64,
+}
+
 fn is_sure(known: Option<ThetaKnowledge>) -> bool {
     known.is_some_and(|known| known.std_dev <= THETA_SURE_RATIO * known.theta)
 }
@@ -38,24 +47,18 @@ pub(super) struct Gain {
 }
 
 impl Gain {
-    /// Adds a tick of `dt_s` seconds and `driven_m` metres, `since_start_s` seconds after the
-    /// mission's start.
-    pub(super) fn add(
-        &mut self,
-        ground: &GroundRecord,
-        (dt_s, driven_m): (f64, f64),
-        since_start_s: f64,
-    ) {
+    /// Adds a tick.
+    pub(super) fn add(&mut self, ground: &GroundRecord, tick: GainTick) {
         self.traction_limit_mu = ground.traction_limit_mu.or(self.traction_limit_mu);
         if ground.is_on_the_map {
-            self.known_m += driven_m;
+            self.known_m += tick.driven_m;
         }
         if is_sure(ground.given) {
-            self.known_s += dt_s;
+            self.known_s += tick.dt_s;
         }
         if is_sure(ground.measured) {
-            self.known_alone_s += dt_s;
-            self.first_known_alone_s.get_or_insert(since_start_s);
+            self.known_alone_s += tick.dt_s;
+            self.first_known_alone_s.get_or_insert(tick.since_start_s);
         }
     }
 

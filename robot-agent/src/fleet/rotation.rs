@@ -9,6 +9,7 @@
 //! that it reaches first (as RFC 8305 does for the addresses of a host). It skips a server that fell silent, or
 //! failed slowly, for some time.
 
+use std::ops::Range;
 use std::time::Duration;
 
 /// First and longest pause after no server could be reached.
@@ -47,12 +48,12 @@ pub struct Server {
 }
 
 impl Server {
-    /// Notes an attempt that failed.
-    fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) {
+    /// Notes an attempt that failed, from its begin to its failure.
+    fn failed(&mut self, attempt: &Range<Duration>, is_distrusted: bool) {
         if is_distrusted {
-            self.skipped_until = now + DISTRUSTED_PAUSE_MAX;
-        } else if now.saturating_sub(began) >= LONG {
-            self.skipped_until = now + SKIP_AFTER_SLOW_FAILURE;
+            self.skipped_until = attempt.end + DISTRUSTED_PAUSE_MAX;
+        } else if attempt.end.saturating_sub(attempt.start) >= LONG {
+            self.skipped_until = attempt.end + SKIP_AFTER_SLOW_FAILURE;
         }
     }
 }
@@ -69,10 +70,10 @@ pub struct ParallelAttempt<'rotation> {
 }
 
 impl ParallelAttempt<'_> {
-    /// Notes an attempt that failed at `now`.
-    pub fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) {
-        self.server.failed((began, now), is_distrusted);
-        let passed_over = self.server.skipped_until.saturating_sub(now);
+    /// Notes an attempt that failed, from its begin to its failure.
+    pub fn failed(&mut self, attempt: &Range<Duration>, is_distrusted: bool) {
+        self.server.failed(attempt, is_distrusted);
+        let passed_over = self.server.skipped_until.saturating_sub(attempt.end);
         self.pause = passed_over.max(ATTEMPT_DELAY);
     }
 }
@@ -159,12 +160,12 @@ impl Rotation {
         }
     }
 
-    /// Goes on to the next server after an attempt that failed at `now`. Returns the pause before that one
-    /// is tried: none until all have been.
-    pub fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) -> Duration {
+    /// Goes on to the next server after an attempt that failed, from its begin to its failure. Returns the
+    /// pause before that one is tried: none until all have been.
+    pub fn failed(&mut self, attempt: &Range<Duration>, is_distrusted: bool) -> Duration {
         self.is_distrusted &= is_distrusted;
-        self.servers[self.at].failed((began, now), is_distrusted);
-        if !self.next(now) {
+        self.servers[self.at].failed(attempt, is_distrusted);
+        if !self.next(attempt.end) {
             return Duration::ZERO;
         }
         let longest = if self.is_distrusted {
@@ -213,7 +214,7 @@ mod tests {
             tried.push_str(&rotation.endpoint()[5..6]);
             let began = *now;
             *now += Duration::from_secs_f64(*took_s);
-            let pause = rotation.failed((began, *now), false);
+            let pause = rotation.failed(&(began..*now), false);
             *now += pause;
             pauses.push(pause.as_millis());
         }
@@ -266,8 +267,8 @@ mod tests {
         assert_eq!(rotation.endpoint(), "tls/s1:7447");
         assert_eq!(parallel(&mut rotation, now), [(2, 200), (0, 400)]);
         let (_, mut others) = rotation.attempts(now);
-        others[0].failed((now, now), true);
-        others[1].failed((now, now + LONG), false);
+        others[0].failed(&(now..now), true);
+        others[1].failed(&(now..now + LONG), false);
         let pauses = others.iter().map(|attempt| attempt.pause);
         let pauses: Vec<_> = pauses.collect();
         assert_eq!(pauses, [DISTRUSTED_PAUSE_MAX, SKIP_AFTER_SLOW_FAILURE]);
@@ -287,7 +288,7 @@ mod tests {
             let mut longest = Duration::ZERO;
             for _ in 0..20 {
                 for is_distrusted in distrusted {
-                    longest = longest.max(rotation.failed((now, now), is_distrusted));
+                    longest = longest.max(rotation.failed(&(now..now), is_distrusted));
                 }
             }
             longest
@@ -307,7 +308,7 @@ mod tests {
             for step in before {
                 match step {
                     Some(is_distrusted) => {
-                        rotation.failed((now, now), is_distrusted);
+                        rotation.failed(&(now..now), is_distrusted);
                     }
                     None => rotation.leave(now),
                 }
@@ -318,7 +319,7 @@ mod tests {
             let mut pauses = 0;
             for _ in 0..count {
                 tried.insert(rotation.endpoint().to_owned());
-                pauses += usize::from(!rotation.failed((now, now), false).is_zero());
+                pauses += usize::from(!rotation.failed(&(now..now), false).is_zero());
             }
             prop_assert_eq!((tried.len(), pauses), (count, 1));
         }

@@ -82,8 +82,7 @@ impl GroundMap {
         Ok(Self { patches, elsewhere })
     }
 
-    fn curve(&self, (x_m, y_m): (f64, f64), at: Duration) -> FrictionCurve {
-        let point = Point { x_m, y_m };
+    fn curve(&self, point: Point, at: Duration) -> FrictionCurve {
         let patch = self
             .patches
             .iter()
@@ -96,9 +95,16 @@ impl GroundMap {
     pub fn under(&self, pose: Pose, track_width_m: f64, at: Duration) -> Ground {
         let (sin, cos) = pose.heading_rad.sin_cos();
         let half_m = 0.5 * track_width_m;
+        let curve = |left_m: f64| {
+            let point = Point {
+                x_m: pose.x_m - left_m * sin,
+                y_m: pose.y_m + left_m * cos,
+            };
+            self.curve(point, at)
+        };
         Ground {
-            left: self.curve((pose.x_m - half_m * sin, pose.y_m + half_m * cos), at),
-            right: self.curve((pose.x_m + half_m * sin, pose.y_m - half_m * cos), at),
+            left: curve(half_m),
+            right: curve(-half_m),
         }
     }
 }

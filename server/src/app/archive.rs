@@ -192,7 +192,7 @@ impl App {
     async fn set_archive_mark(&self, keys: KeyRange) -> Result<(), AppError> {
         let mark = keys.joined_to(self.stored_mark().await?);
         let mut tx = self.db().write_uncounted("archive").await?;
-        db::archive_mark::set(&mut tx, (mark.first, mark.last)).await?;
+        db::archive_mark::set(&mut tx, mark.first..=mark.last).await?;
         Ok(tx.commit().await?)
     }
 
@@ -307,7 +307,7 @@ impl App {
 
     /// Returns the first measurements of the database in a range of keys.
     async fn rows_of(&self, keys: KeyRange) -> Result<Vec<ArchivedSegment>, AppError> {
-        let range = (keys.first - 1, keys.last);
+        let range = keys.first..=keys.last;
         let reading = async {
             let mut tx = self.db().read("archive").await?;
             let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;

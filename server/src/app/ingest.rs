@@ -36,7 +36,7 @@ use self::prepared::{Prepared, Ready, Skew, prepared, us_of};
 use super::App;
 use super::map::{Folded, MapChange};
 use super::missions::reports::{Foreign, ReportEffect, Reporting, apply_mission_report};
-use crate::db::deferred_segments::{DeferredFilter, Origin};
+use crate::db::deferred_segments::{DeferredFilter, DeferredTimes, Origin};
 use crate::db::segments::{Added, NewSegment};
 use crate::db::sums::SumKey;
 use crate::db::withdrawals::WithdrawalRow;
@@ -360,8 +360,7 @@ impl Writer {
                                     site_pk,
                                     robot_pk,
                                 };
-                                let times = (segment.ended_at, now);
-                                match defer(&mut tx, origin, times, &measurement).await? {
+                                match defer(&mut tx, origin, segment, now, &measurement).await? {
                                     Ok(true) => {
                                         receipt.committed += 1;
                                         tally.deferred += 1;
@@ -612,7 +611,8 @@ async fn released(
 async fn defer(
     tx: &mut Tx,
     origin: Origin,
-    (ended_at, now): (Timestamp, Timestamp),
+    segment: &Segment,
+    received_at: Timestamp,
     measurement: &RawValue,
 ) -> Result<Result<bool, String>, DbError> {
     if db::deferred_segments::count(tx, origin.robot_pk).await? >= DEFERRED_MAX {
@@ -620,14 +620,12 @@ async fn defer(
             "{DEFERRED_MAX} of this robot's measurements already wait for their clock"
         )));
     }
-    let times = (ended_at.as_microsecond(), now.as_microsecond());
-    Ok(Ok(db::deferred_segments::put(
-        tx,
-        origin,
-        times,
-        measurement,
-    )
-    .await?))
+    let times = DeferredTimes {
+        ended_at: segment.ended_at,
+        received_at,
+    };
+    let put = db::deferred_segments::put(tx, origin, times, measurement);
+    Ok(Ok(put.await?))
 }
 
 /// Applies a report, unless it was applied before; then it returns `None`.

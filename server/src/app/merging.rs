@@ -104,7 +104,7 @@ impl App {
                 break;
             }
             let epoch = hour.horizons.epoch_of(hour.epoch_h);
-            let rows = db::sums::of_hour(&mut tx, (hour.robot_pk, hour.epoch_h), left).await?;
+            let rows = db::sums::of_hour(&mut tx, *hour, left).await?;
             taken += rows.len();
             done += usize::from(rows.len() < left);
             for row in rows {

@@ -69,6 +69,13 @@ struct Rectangle {
     height: usize,
 }
 
+/// Position in an image, in pixels.
+#[derive(Debug, Clone, Copy)]
+struct Position {
+    x: usize,
+    y: usize,
+}
+
 /// RGBA image, initially transparent.
 struct Canvas {
     width: usize,
@@ -77,7 +84,7 @@ struct Canvas {
 }
 
 impl Canvas {
-    fn put(&mut self, x: usize, y: usize, [red, green, blue]: Rgb) {
+    fn put(&mut self, Position { x, y }: Position, [red, green, blue]: Rgb) {
         if x < self.width && y < self.height {
             let at = 4 * (y * self.width + x);
             self.pixels[at..at + 4].copy_from_slice(&[red, green, blue, 255]);
@@ -85,14 +92,14 @@ impl Canvas {
     }
 
     fn fill(&mut self, within: Rectangle, ink: Rgb) {
-        for row in within.y..within.y + within.height {
-            for column in within.x..within.x + within.width {
-                self.put(column, row, ink);
+        for y in within.y..within.y + within.height {
+            for x in within.x..within.x + within.width {
+                self.put(Position { x, y }, ink);
             }
         }
     }
 
-    fn write(&mut self, (x, y): (usize, usize), text: &str) {
+    fn write(&mut self, Position { x, y }: Position, text: &str) {
         let [red, green, blue] = INK;
         let style = MonoTextStyle::new(&FONT, Rgb888::new(red, green, blue));
         let place = |pixels: usize| i32::try_from(pixels).unwrap_or(i32::MAX);
@@ -118,7 +125,7 @@ impl DrawTarget for Canvas {
     ) -> Result<(), Infallible> {
         for Pixel(at, ink) in pixels {
             if let (Ok(x), Ok(y)) = (usize::try_from(at.x), usize::try_from(at.y)) {
-                self.put(x, y, [ink.r(), ink.g(), ink.b()]);
+                self.put(Position { x, y }, [ink.r(), ink.g(), ink.b()]);
             }
         }
         Ok(())
@@ -158,7 +165,8 @@ pub fn encode(raster: &Raster, scale: Option<usize>) -> Result<Vec<u8>, PngError
     for (row, squares) in raster.rows().rev().enumerate() {
         for (column, square) in squares.iter().enumerate() {
             if let Some(known) = square.known() {
-                draw(&mut canvas, (column * scale, row * scale), scale, &known);
+                let (x, y) = (column * scale, row * scale);
+                draw(&mut canvas, Position { x, y }, scale, &known);
             }
         }
     }
@@ -166,27 +174,28 @@ pub fn encode(raster: &Raster, scale: Option<usize>) -> Result<Vec<u8>, PngError
     write(&canvas, raster)
 }
 
-fn draw(canvas: &mut Canvas, (x, y): (usize, usize), scale: usize, known: &KnownCell) {
+fn draw(canvas: &mut Canvas, corner: Position, scale: usize, known: &KnownCell) {
     let density = if scale < HATCHED_SIDE_PX {
         0
     } else {
         density(known.std_dev / known.theta)
     };
     let ink = cividis(share(known.theta));
-    for row in y..y + scale {
-        for column in x..x + scale {
-            canvas.put(column, row, hatched((column, row), density, ink));
+    for y in corner.y..corner.y + scale {
+        for x in corner.x..corner.x + scale {
+            let at = Position { x, y };
+            canvas.put(at, hatched(at, density, ink));
         }
     }
 }
 
 /// Returns the colour of a pixel: diagonal lines, light with a dark edge, are visible on every colour
 /// of the scale.
-fn hatched((column, row): (usize, usize), density: usize, ink: Rgb) -> Rgb {
+fn hatched(at: Position, density: usize, ink: Rgb) -> Rgb {
     let Some(distance) = density.checked_sub(1).map(|index| LINES_PX[index]) else {
         return ink;
     };
-    match (column + row) % distance {
+    match (at.x + at.y) % distance {
         0 => WHITE,
         1 => ink.map(|channel| channel / 2),
         _ => ink,
@@ -194,7 +203,7 @@ fn hatched((column, row): (usize, usize), density: usize, ink: Rgb) -> Rgb {
 }
 
 /// Draws a tick below a colour bar.
-fn draw_tick(canvas: &mut Canvas, (x, y): (usize, usize), text: &str) {
+fn draw_tick(canvas: &mut Canvas, Position { x, y }: Position, text: &str) {
     let tick = Rectangle {
         x,
         y,
@@ -206,7 +215,7 @@ fn draw_tick(canvas: &mut Canvas, (x, y): (usize, usize), text: &str) {
     let left = x
         .saturating_sub(width_px / 2)
         .min(canvas.width - width_px - 1);
-    canvas.write((left, y + 4), text);
+    canvas.write(Position { x: left, y: y + 4 }, text);
 }
 
 /// Draws a colour bar for θ and a hatched one for the relative standard deviation, from a row down to the
@@ -232,7 +241,7 @@ fn draw_legend(canvas: &mut Canvas, top: usize) {
     let bar = width - left - 2 * MARGIN_PX;
     let at = |share: f64| left + (share * bar as f64).round() as usize;
     let mut y = top + MARGIN_PX;
-    canvas.write((MARGIN_PX, y), "θ");
+    canvas.write(Position { x: MARGIN_PX, y }, "θ");
     for column in 0..bar {
         let ink = cividis(column as f64 / bar as f64);
         let line = Rectangle {
@@ -247,21 +256,23 @@ fn draw_legend(canvas: &mut Canvas, top: usize) {
     for tick in TICKS {
         let value = tick.parse().unwrap_or(THETA_LOW);
         let x = at((value / THETA_LOW).ln() / (THETA_HIGH / THETA_LOW).ln());
-        draw_tick(canvas, (x, y), tick);
+        draw_tick(canvas, Position { x, y }, tick);
     }
     y += letters + 2 + 2 * MARGIN_PX;
-    canvas.write((MARGIN_PX, y), "σ/θ");
+    canvas.write(Position { x: MARGIN_PX, y }, "σ/θ");
     for column in 0..bar {
         let density = density(column as f64 / bar as f64 * LEGEND_END);
-        for row in y..y + BAR_PX {
-            let at = (left + column, row);
-            canvas.put(at.0, at.1, hatched(at, density, cividis(0.5)));
+        let x = left + column;
+        for y in y..y + BAR_PX {
+            let at = Position { x, y };
+            canvas.put(at, hatched(at, density, cividis(0.5)));
         }
     }
     y += BAR_PX;
     for least in HATCHED {
         let tick = &format!("{:.0}%", 100.0 * least);
-        draw_tick(canvas, (at(least / LEGEND_END), y), tick);
+        let x = at(least / LEGEND_END);
+        draw_tick(canvas, Position { x, y }, tick);
     }
 }
 

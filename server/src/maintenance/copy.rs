@@ -115,7 +115,7 @@ pub(crate) async fn run(args: CopyArgs) -> anyhow::Result<()> {
         file_owner::chown_database(file)?;
     }
     let copied = copied.with_context(|| format!("`{from}` was not copied to `{to}`"))?;
-    print_outcome(&copied, (&from, &to)).context("cannot print")
+    print_outcome(&copied, &CopyArgs { from, to, quiet }).context("cannot print")
 }
 
 /// Returns whether two names lead to one file.
@@ -239,7 +239,8 @@ impl ProgressPrinter {
     }
 }
 
-fn print_outcome(copied: &[Copied], (from, to): (&Location, &Location)) -> io::Result<()> {
+fn print_outcome(copied: &[Copied], args: &CopyArgs) -> io::Result<()> {
+    let CopyArgs { from, to, .. } = args;
     let mut out = io::stdout().lock();
     writeln!(out, "{:24} {:>14}  SHA-256 of the rows", "table", "rows")?;
     for one in copied.iter().filter(|one| one.contents.rows > 0) {

@@ -387,7 +387,7 @@ impl Provider {
                 | HttpError::Status(_)
                 | HttpError::NoAnswer) => ExchangeError::Unanswered(Box::new(error)),
             })?;
-            claims = with_user_info((claims, user_info), &self.groups_claim)?;
+            merge(&mut claims, user_info, &self.groups_claim)?;
         }
         let id_token = id_token.to_string();
         Ok(AuthenticatedPerson {
@@ -435,12 +435,9 @@ impl Provider {
 ///
 /// # Errors
 /// [`ExchangeError::UserInfo`] if the user info is not about the subject of the ID token.
-fn with_user_info(
-    (mut claims, user_info): (Claims, Claims),
-    groups_claim: &str,
-) -> Result<Claims, ExchangeError> {
+fn merge(claims: &mut Claims, user_info: Claims, groups_claim: &str) -> Result<(), ExchangeError> {
     let subject = |of: &Claims| of.get("sub")?.as_str().map(str::to_owned);
-    if subject(&user_info).is_none_or(|user_info| subject(&claims) != Some(user_info)) {
+    if subject(&user_info).is_none_or(|user_info| subject(claims) != Some(user_info)) {
         let detail = "its user info is about somebody else".to_owned();
         return Err(ExchangeError::UserInfo(detail));
     }
@@ -456,7 +453,7 @@ fn with_user_info(
             claims.entry(name).or_insert(value);
         }
     }
-    Ok(claims)
+    Ok(())
 }
 
 type TokenError = RequestTokenError<HttpError, StandardErrorResponse<CoreErrorResponseType>>;
@@ -491,10 +488,11 @@ mod tests {
                 "sub": subject, "name": "Bert", "realm_access": {"roles": ["night"]}, "realm": 3,
             }))
         };
-        let both = with_user_info((own(), said("7")), "realm_access.roles").unwrap();
+        let mut both = own();
+        merge(&mut both, said("7"), "realm_access.roles").unwrap();
         let groups = claim(&both, "realm_access.roles");
         assert_eq!(groups, Some(&json!(["night"])));
         assert_eq!(both["name"], "Anna", "the signed one counts");
-        assert!(with_user_info((own(), said("8")), "realm_access.roles").is_err());
+        assert!(merge(&mut own(), said("8"), "realm_access.roles").is_err());
     }
 }

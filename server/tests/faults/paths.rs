@@ -19,7 +19,7 @@ use tread_server::authority::Issued;
 use tread_server::config::RetentionConfig;
 use tread_server::db::alerts::AlertLocation;
 use tread_server::db::audit::AuditRetention;
-use tread_server::db::deferred_segments::{DeferredFilter, Origin};
+use tread_server::db::deferred_segments::{DeferredFilter, DeferredTimes, Origin};
 use tread_server::db::enrolments::Renewal;
 use tread_server::db::idempotency::StoredAnswer;
 use tread_server::db::missions::{Facts, Transition};
@@ -275,9 +275,11 @@ pub(crate) const PATHS: &[WritePath] = &[
                     robot_pk: ground.robot_pk,
                 };
                 let measurement = serde_json::value::RawValue::from_string("{}".to_owned());
-                let at_us = later().as_microsecond();
-                db::deferred_segments::put(tx, origin, (at_us, at_us), &measurement.unwrap())
-                    .await?;
+                let times = DeferredTimes {
+                    ended_at: later(),
+                    received_at: later(),
+                };
+                db::deferred_segments::put(tx, origin, times, &measurement.unwrap()).await?;
                 let filter = DeferredFilter {
                     boot_pk,
                     ended_until_us: 0,
@@ -295,7 +297,7 @@ pub(crate) const PATHS: &[WritePath] = &[
             Box::pin(async move {
                 let mut tx = ground.app.db().write_uncounted("archive").await?;
                 let last = i64::try_from(number).unwrap() + 1;
-                db::archive_mark::set(&mut tx, (1, last)).await?;
+                db::archive_mark::set(&mut tx, 1..=last).await?;
                 Ok(tx.commit().await?)
             })
         },

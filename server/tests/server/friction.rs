@@ -1,6 +1,7 @@
 //! Questions about the map, and what a bad question gets.
 
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 
 use jiff::{SignedDuration, Timestamp};
 use reqwest::{StatusCode, header};
@@ -35,13 +36,14 @@ fn close(left: f64, right: f64) -> bool {
     (left - right).abs() < 1e-9
 }
 
-fn rectangle(x_min_m: f64, x_max_m: f64) -> Value {
+fn rectangle(x_m: RangeInclusive<f64>) -> Value {
+    let (x_min_m, x_max_m) = x_m.into_inner();
     json!([{"x_m": x_min_m, "y_m": -5.0}, {"x_m": x_max_m, "y_m": -5.0},
            {"x_m": x_max_m, "y_m": 5.0}, {"x_m": x_min_m, "y_m": 5.0}])
 }
 
-async fn draw(yard: &Yard, id: &str, class: &str, (x_min_m, x_max_m): (f64, f64)) {
-    let body = json!({"id": id, "class": class, "polygon": rectangle(x_min_m, x_max_m)});
+async fn draw(yard: &Yard, id: &str, class: &str, x_m: RangeInclusive<f64>) {
+    let body = json!({"id": id, "class": class, "polygon": rectangle(x_m)});
     let (status, body) = yard.post("/v1/sites/yard/terrains", &body).await;
     assert_eq!(status, StatusCode::CREATED, "{body}");
 }
@@ -65,9 +67,9 @@ pub(crate) fn numbered(segments: impl IntoIterator<Item = Segment>) -> Vec<Recor
 /// road beside it driven by one, a meadow that nobody has driven.
 async fn measured_yard() -> Yard {
     let yard = Yard::start_at(after_h(10)).await;
-    draw(&yard, "lawn", "grass", (0.0, 10.5)).await;
-    draw(&yard, "road", "asphalt", (10.5, 20.0)).await;
-    draw(&yard, "meadow", "grass", (30.0, 40.0)).await;
+    draw(&yard, "lawn", "grass", 0.0..=10.5).await;
+    draw(&yard, "road", "asphalt", 10.5..=20.0).await;
+    draw(&yard, "meadow", "grass", 30.0..=40.0).await;
     let lawn = |theta: f64| (0..11).map(move |ix| on("lawn", (ix, 0), theta, i64::from(ix % 5)));
     let road = (10..20).map(|ix| on("road", (ix, 0), 0.05, 6));
     let one = Robot::join(&yard, "rover-1").await;
@@ -309,7 +311,7 @@ async fn an_answer_says_which_normalisation_it_used() {
         }];
     })
     .await;
-    draw(&yard, "lawn", "grass", (0.0, 10.5)).await;
+    draw(&yard, "lawn", "grass", 0.0..=10.5).await;
     let one = Robot::join(&yard, "rover-1").await;
     let own = on("lawn", (1, 0), 0.2, 0);
     one.upload(numbered([own])).await.unwrap();

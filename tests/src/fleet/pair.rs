@@ -9,7 +9,7 @@ use nix::sys::signal::Signal;
 use reqwest::Method;
 use tokio::time::timeout;
 
-use super::Fleet;
+use super::{Fleet, ServerPlace};
 use crate::ports::free_address;
 use crate::process::{Process, Usage};
 use crate::relay::Relay;
@@ -116,7 +116,11 @@ impl Fleet {
     /// Starts the server that does not work, which stands by then.
     pub fn start_other_server(&mut self) {
         if let Some(other) = &self.other {
-            let place = (other.http, other.zenoh, Some(&other.network));
+            let place = ServerPlace {
+                http: other.http,
+                zenoh: other.zenoh,
+                network: Some(&other.network),
+            };
             let started = self.server_process(other.name, place);
             if let Some(other) = &mut self.other {
                 other.process = Some(started);
@@ -169,8 +173,7 @@ impl Fleet {
             return;
         }
         if self.has_server_ended() {
-            let place = (self.http, self.zenoh, self.network.as_ref());
-            self.server = Some(self.server_process(self.server_name, place));
+            self.server = Some(self.server_process(self.server_name, self.place()));
         }
         if self.has_other_server_ended() {
             self.start_other_server();

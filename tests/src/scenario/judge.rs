@@ -261,7 +261,7 @@ mod tests {
 
     use super::*;
 
-    fn sample(at_s: f64, (x_m, y_m): (f64, f64), speed_m_s: f64) -> TruthSample {
+    fn sample(at_s: f64, Point { x_m, y_m }: Point, speed_m_s: f64) -> TruthSample {
         TruthSample {
             at: Duration::from_secs_f64(at_s),
             state: PlantState {
@@ -284,14 +284,20 @@ mod tests {
         let aside = [0.9, 0.0, 0.1, 0.4, 0.5, 0.1, -0.31, -0.29];
         let samples: Vec<TruthSample> = (0_u32..)
             .zip(aside)
-            .map(|(step, y_m)| sample(f64::from(step), (0.6 * f64::from(step), y_m), 0.5))
+            .map(|(step, y_m)| {
+                let x_m = 0.6 * f64::from(step);
+                sample(f64::from(step), Point { x_m, y_m }, 0.5)
+            })
             .collect();
         let start = Pose::default();
         let found = tracking(&samples, start, &paper_robot(), &asked).unwrap();
         assert_eq!(found.departures, 2);
         assert!((found.farthest_m - 0.5).abs() < 0.01, "{found:?}");
         // Past its end it is as far off as it has overrun it.
-        let overrun = [sample(0.0, (5.0, 0.0), 0.5), sample(1.0, (5.4, 0.0), 0.1)];
+        let overrun = [
+            sample(0.0, Point { x_m: 5.0, y_m: 0.0 }, 0.5),
+            sample(1.0, Point { x_m: 5.4, y_m: 0.0 }, 0.1),
+        ];
         let found = tracking(&overrun, start, &paper_robot(), &asked).unwrap();
         assert_eq!(found.departures, 1);
         assert!((found.farthest_m - 0.4).abs() < 0.03, "{found:?}");
@@ -300,11 +306,11 @@ mod tests {
     #[test]
     fn stopping_is_from_the_word_to_rest() {
         let samples = [
-            sample(1.0, (0.0, 0.0), 1.0),
-            sample(2.0, (1.0, 0.0), 1.0),
-            sample(3.0, (1.6, 0.0), 0.4),
-            sample(4.0, (1.7, 0.0), 0.0),
-            sample(5.0, (1.7, 0.0), 0.0),
+            sample(1.0, Point { x_m: 0.0, y_m: 0.0 }, 1.0),
+            sample(2.0, Point { x_m: 1.0, y_m: 0.0 }, 1.0),
+            sample(3.0, Point { x_m: 1.6, y_m: 0.0 }, 0.4),
+            sample(4.0, Point { x_m: 1.7, y_m: 0.0 }, 0.0),
+            sample(5.0, Point { x_m: 1.7, y_m: 0.0 }, 0.0),
         ];
         let found = stopping(&samples, Duration::from_secs(2)).unwrap();
         assert!((found.distance_m - 0.7).abs() < 1.0e-9, "{found:?}");

@@ -1,7 +1,7 @@
 //! Forward and lateral speed: wheels, odometry over ground, and position fixes.
 
 use super::axis::{Axis, Rates, Tolerance, finding, kind_of};
-use super::vote::{Favoured, Vote};
+use super::vote::{Differences, Favoured, Vote};
 use super::wheels::{self, CORROBORATED, WHEELS};
 use super::{BODY, RAISE_FIX_S, RAISE_FROZEN_S, RAISE_SLIP_S, Recent, Verdicts, View};
 use crate::consistency::fixes::FixResidual;
@@ -178,16 +178,16 @@ fn isolate_fault(
     let position = wheels + residual.forward_error_m_s;
     let commanded = view.commanded(residual);
     let vote = Vote {
-        by_wheels: view.channels.wheels.then_some((
-            (residual.odometry_error_m_s - residual.forward_error_m_s).abs(),
-            residual.forward_error_m_s.abs(),
-        )),
+        by_wheels: view.channels.wheels.then_some(Differences {
+            fast: (residual.odometry_error_m_s - residual.forward_error_m_s).abs(),
+            fixes: residual.forward_error_m_s.abs(),
+        }),
         slack: AXIS.slack(WHEELS, wheels, odometry.abs().min(position.abs())),
         noise: residual.noise_m_s,
-        by_command: (!view.is_saturated(means.wheels, &commanded)).then_some((
-            AXIS.command_distance(odometry, &commanded),
-            AXIS.command_distance(position, &commanded),
-        )),
+        by_command: (!view.is_saturated(means.wheels, &commanded)).then_some(Differences {
+            fast: AXIS.command_distance(odometry, &commanded),
+            fixes: AXIS.command_distance(position, &commanded),
+        }),
     };
     let repeats = view.repeats;
     let of_odometry = Comparison {

@@ -1,7 +1,7 @@
 //! Turn rate: gyro, wheels, and the heading of position fixes.
 
 use super::axis::{Axis, Rates, Tolerance, finding, kind_of};
-use super::vote::{Favoured, Vote};
+use super::vote::{Differences, Favoured, Vote};
 use super::wheels::{self, CORROBORATED, WHEELS};
 use super::{
     BODY, NEARER_TO_FIXES_NOISE_RATIO, RAISE_FAST_S, RAISE_FIX_S, RAISE_FROZEN_S, RAISE_SLIP_S,
@@ -127,16 +127,16 @@ fn isolate_fault(view: &View<'_>, residual: &FixResidual, means: &Means, verdict
     let by_gain = (1.0 - gain.unwrap_or(1.0)) * wheels;
     let tolerance = if gain.is_some() { LEARNED } else { WHEELS };
     let vote = Vote {
-        by_wheels: view.channels.wheels.then_some((
-            (residual.turn_error_rad_s - residual.wheels_turn_error_rad_s + by_gain).abs(),
-            (residual.wheels_turn_error_rad_s + by_gain).abs(),
-        )),
+        by_wheels: view.channels.wheels.then_some(Differences {
+            fast: (residual.turn_error_rad_s - residual.wheels_turn_error_rad_s + by_gain).abs(),
+            fixes: (residual.wheels_turn_error_rad_s + by_gain).abs(),
+        }),
         slack: AXIS.slack(tolerance, wheels, gyro.abs().min(heading.abs())),
         noise: residual.wheels_noise_rad_s,
-        by_command: (!view.is_saturated(means.wheels, &commanded)).then_some((
-            AXIS.command_distance(gyro, &commanded),
-            AXIS.command_distance(heading, &commanded),
-        )),
+        by_command: (!view.is_saturated(means.wheels, &commanded)).then_some(Differences {
+            fast: AXIS.command_distance(gyro, &commanded),
+            fixes: AXIS.command_distance(heading, &commanded),
+        }),
     };
     let repeats = view.repeats;
     let of_gyro = Comparison {

@@ -16,18 +16,24 @@ pub(super) enum Favoured {
     Fixes,
 }
 
-/// Differences of two channels of the body from wheels and command, `(fast channel, fixes)`,
-/// magnitudes in m/s or rad/s.
+/// Differences of the two channels of the body from one other channel, magnitudes in m/s or rad/s.
+#[derive(Clone, Copy)]
+pub(super) struct Differences {
+    pub(super) fast: f64,
+    pub(super) fixes: f64,
+}
+
+/// Differences of two channels of the body from wheels and command.
 pub(super) struct Vote {
     /// Differences from the wheels; None if the wheels are not compared.
-    pub(super) by_wheels: Option<(f64, f64)>,
+    pub(super) by_wheels: Option<Differences>,
     /// Tolerated difference from the wheels.
     pub(super) slack: f64,
     /// Noise of the fixes, tolerated in addition.
     pub(super) noise: f64,
     /// Differences from the command; None if motors may be saturated: then the command is no
     /// evidence.
-    pub(super) by_command: Option<(f64, f64)>,
+    pub(super) by_command: Option<Differences>,
 }
 
 impl Vote {
@@ -38,8 +44,8 @@ impl Vote {
             return by_command;
         };
         let agrees = (
-            by_wheels.0 <= self.slack,
-            by_wheels.1 <= self.slack + self.noise,
+            by_wheels.fast <= self.slack,
+            by_wheels.fixes <= self.slack + self.noise,
         );
         let favoured = match agrees {
             (true, false) => Some(Favoured::Fast),
@@ -52,11 +58,11 @@ impl Vote {
     }
 }
 
-/// Returns which of two distances is the smaller by the ratio `share`.
-fn nearer((first, second): (f64, f64), share: f64) -> Option<Favoured> {
-    if first < share * second {
+/// Returns the channel whose difference is the smaller by the ratio `share`.
+fn nearer(off: Differences, share: f64) -> Option<Favoured> {
+    if off.fast < share * off.fixes {
         Some(Favoured::Fast)
-    } else if second < share * first {
+    } else if off.fixes < share * off.fast {
         Some(Favoured::Fixes)
     } else {
         None

@@ -426,7 +426,7 @@ pub(super) fn squares(
             match map
                 .map()
                 .changes()
-                .first_column((Block::of(low), Block::of(high)))
+                .first_column(Block::of(low)..=Block::of(high))
             {
                 Some(column) => {
                     let begin = Block { row: 0, column }.first().ix;

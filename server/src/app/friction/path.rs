@@ -177,8 +177,8 @@ pub(super) fn cut(points: &[Point], grid: &Grid) -> Result<Vec<Cut>, AppError> {
             x_m: begin.x_m + share * (end.x_m - begin.x_m),
             y_m: begin.y_m + share * (end.y_m - begin.y_m),
         };
-        let mut shares = crossings((begin.x_m, end.x_m), grid.cell_m);
-        shares.extend(crossings((begin.y_m, end.y_m), grid.cell_m));
+        let mut shares = crossings(pair, |point| point.x_m, grid.cell_m);
+        shares.extend(crossings(pair, |point| point.y_m, grid.cell_m));
         shares.extend([0.0, 1.0]);
         shares.sort_unstable_by(f64::total_cmp);
         for (place, pair) in shares.windows(2).enumerate() {
@@ -206,7 +206,8 @@ pub(super) fn cut(points: &[Point], grid: &Grid) -> Result<Vec<Cut>, AppError> {
 }
 
 /// Returns the fractions of a side (0 to 1) at which one coordinate crosses a border between cells.
-fn crossings((from_m, to_m): (f64, f64), cell_m: f64) -> Vec<f64> {
+fn crossings(side: &[Point], coordinate_m: fn(&Point) -> f64, cell_m: f64) -> Vec<f64> {
+    let (from_m, to_m) = (coordinate_m(&side[0]), coordinate_m(&side[1]));
     let (low, high) = (from_m.min(to_m) / cell_m, from_m.max(to_m) / cell_m);
     let mut border = low.floor() + 1.0;
     let mut shares = Vec::new();

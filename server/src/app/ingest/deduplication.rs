@@ -1,6 +1,7 @@
 //! Which segments are stored already, or were stored and removed at the end of their retention.
 
 use std::collections::{BTreeMap, HashMap};
+use std::ops::RangeInclusive;
 
 use super::Candidate;
 use super::keys::Keys;
@@ -22,21 +23,21 @@ impl Deduplication {
         removed: &Removed,
         keys: &mut Keys,
     ) -> Result<Self, DbError> {
-        let mut spans: HashMap<i64, (i64, i64)> = HashMap::new();
+        let mut spans: HashMap<i64, RangeInclusive<i64>> = HashMap::new();
         for candidate in candidates {
             let RecordKey { boot_pk, seq } = candidate.key;
-            let span = spans.entry(boot_pk).or_insert((seq, seq));
-            *span = (span.0.min(seq), span.1.max(seq));
+            let span = spans.entry(boot_pk).or_insert(seq..=seq);
+            *span = seq.min(*span.start())..=seq.max(*span.end());
         }
         let mut found = Self::default();
         for (boot_pk, span) in spans {
             let newest = keys.newest_seq(tx, boot_pk).await?;
-            let seq = span.1;
+            let seq = *span.end();
             keys.record_seq(RecordKey { boot_pk, seq });
-            if newest.is_none_or(|newest| newest < span.0) {
+            if newest.is_none_or(|newest| newest < *span.start()) {
                 continue;
             }
-            let mut ranges = db::segment_ranges::within(tx, boot_pk, span).await?;
+            let mut ranges = db::segment_ranges::within(tx, boot_pk, span.clone()).await?;
             if removed.has(boot_pk) {
                 ranges.extend(db::removed::within(tx, boot_pk, span).await?);
             }

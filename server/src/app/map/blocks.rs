@@ -323,8 +323,7 @@ impl App {
         for &block in absent {
             let mut cells = BlockBuilder::default();
             let mut is_known = true;
-            let at = (block.row, block.column);
-            db::sums::of_block(tx, row.pk, at, |sum| {
+            db::sums::of_block(tx, row.pk, block.first(), |sum| {
                 sums += 1;
                 is_known &= maps.build(row, &mut cells, &sum);
             })

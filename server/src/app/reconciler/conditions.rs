@@ -49,6 +49,13 @@ struct Memory {
     is_clock_wrong: bool,
 }
 
+/// Change of what is remembered of a robot.
+#[derive(Debug, Clone, Copy)]
+struct MemoryChange {
+    before: Memory,
+    after: Memory,
+}
+
 impl Memory {
     /// Takes in what the robot shows; `is_waiting` and `is_clock_wrong` are right afterwards.
     fn judge(&mut self, shown: ReportedCondition, now: Duration) {
@@ -111,7 +118,11 @@ impl Conditions {
             if (judged.is_waiting, judged.is_clock_wrong)
                 != (memory.is_waiting, memory.is_clock_wrong)
             {
-                store_transition(app, &key, (*memory, judged), shown).await?;
+                let change = MemoryChange {
+                    before: *memory,
+                    after: judged,
+                };
+                store_transition(app, &key, change, shown).await?;
             }
             *memory = judged;
         }
@@ -147,7 +158,11 @@ impl Conditions {
                 mission: None,
                 clock_offset_ms: 0,
             };
-            store_transition(app, key, (*memory, judged), shown).await?;
+            let change = MemoryChange {
+                before: *memory,
+                after: judged,
+            };
+            store_transition(app, key, change, shown).await?;
             *memory = judged;
         }
         Ok(())
@@ -182,7 +197,7 @@ async fn raised(app: &App) -> Result<HashMap<RobotKey, Memory>, AppError> {
 async fn store_transition(
     app: &App,
     (site, robot): &RobotKey,
-    (before, after): (Memory, Memory),
+    MemoryChange { before, after }: MemoryChange,
     shown: ReportedCondition,
 ) -> Result<(), AppError> {
     let mut tx = app.db().write("reconciler").await?;

@@ -6,6 +6,7 @@
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -340,12 +341,11 @@ impl<'map> Cells<'map> {
             ..min
         });
         let last = Block::of(max);
-        let columns = (start.column, last.column);
         let is_any = first_iy <= max.iy && min.ix <= max.ix;
         let rows = self
             .map
             .changes
-            .rows(is_any.then_some((start.row, last.row)));
+            .rows(is_any.then_some(start.row..=last.row));
         let lines = rows.flat_map(move |row| {
             let of_row = Block { row, column: 0 };
             of_row.first().iy.max(first_iy)..=of_row.last().iy.min(max.iy)
@@ -353,12 +353,12 @@ impl<'map> Cells<'map> {
         let found = lines.flat_map(move |iy| {
             // Of the line of `after` nothing before it is needed.
             let of_line = after.filter(|after| after.iy == iy);
-            let begun = of_line.map_or(columns.0, |after| Block::of(after).column.max(columns.0));
-            let blocks = self.map.changes.of_line(iy, (begun, columns.1));
+            let begun = of_line.map_or(start, Block::of).column.max(start.column);
+            let blocks = self.map.changes.of_line(iy, begun..=last.column);
             blocks.flat_map(move |block| {
                 let cells = self.of_block(block);
                 if cells.is_none() {
-                    self.record_absent_from(block, (columns, last.row));
+                    self.record_absent_from(block, (start.column..=last.column, last.row));
                 }
                 let from = block.first().ix.max(min.ix);
                 let to = block.last().ix.min(max.ix);
@@ -375,11 +375,12 @@ impl<'map> Cells<'map> {
     }
 
     /// Notes absent blocks from one on in its row, and in the rows below up to `last_row`.
-    fn record_absent_from(self, from: Block, (columns, last_row): ((i32, i32), i32)) {
-        let rest = self.map.changes.row(from.row, (from.column, columns.1));
+    fn record_absent_from(self, from: Block, (columns, last_row): (RangeInclusive<i32>, i32)) {
+        let rest = from.column..=*columns.end();
+        let rest = self.map.changes.row(from.row, rest);
         let below = from.row.checked_add(1).filter(|&row| row <= last_row);
-        let below = self.map.changes.rows(below.map(|row| (row, last_row)));
-        let below = below.flat_map(|row| self.map.changes.row(row, columns));
+        let below = self.map.changes.rows(below.map(|row| row..=last_row));
+        let below = below.flat_map(|row| self.map.changes.row(row, columns.clone()));
         let absent = rest
             .chain(below)
             .filter(|&block| !self.map.blocks.contains(block));

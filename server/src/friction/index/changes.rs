@@ -139,7 +139,11 @@ impl Changes {
     }
 
     /// Returns the blocks between two columns, both included, with measurements in a line of cells.
-    pub(super) fn of_line(&self, iy: i32, columns: (i32, i32)) -> impl Iterator<Item = Block> + '_ {
+    pub(super) fn of_line(
+        &self,
+        iy: i32,
+        columns: RangeInclusive<i32>,
+    ) -> impl Iterator<Item = Block> + '_ {
         let row = iy.div_euclid(BLOCK_CELLS);
         let blocks = self.range(row, columns);
         let of_line = blocks.filter(move |(_, found)| found.lines & line(iy) != 0);
@@ -152,7 +156,11 @@ impl Changes {
     }
 
     /// Returns the rows with any change between two rows, both included.
-    pub(super) fn rows(&self, between: Option<(i32, i32)>) -> impl Iterator<Item = i32> + '_ {
+    pub(super) fn rows(
+        &self,
+        between: Option<RangeInclusive<i32>>,
+    ) -> impl Iterator<Item = i32> + '_ {
+        let between = between.map(RangeInclusive::into_inner);
         let (mut next, last) = between.map_or((None, i32::MIN), |(low, high)| (Some(low), high));
         std::iter::from_fn(move || {
             let from = Block {
@@ -165,25 +173,29 @@ impl Changes {
         })
     }
 
-    /// Returns the lowest column with any change in the rectangle of blocks from `low` to `high`,
-    /// both included.
-    pub fn first_column(&self, (low, high): (Block, Block)) -> Option<i32> {
-        let rows = self.rows(Some((low.row, high.row)));
-        let columns = (low.column, high.column);
-        let firsts = rows.filter_map(|row| self.row(row, columns).next());
+    /// Returns the lowest column with any change in the rectangle between two blocks, both included.
+    pub fn first_column(&self, blocks: RangeInclusive<Block>) -> Option<i32> {
+        let (low, high) = blocks.into_inner();
+        let rows = self.rows(Some(low.row..=high.row));
+        let firsts = rows.filter_map(|row| self.row(row, low.column..=high.column).next());
         firsts.map(|block| block.column).min()
     }
 
     /// Returns the blocks with any change of a row between two columns, both included.
-    pub(super) fn row(&self, row: i32, columns: (i32, i32)) -> impl Iterator<Item = Block> + '_ {
+    pub(super) fn row(
+        &self,
+        row: i32,
+        columns: RangeInclusive<i32>,
+    ) -> impl Iterator<Item = Block> + '_ {
         self.range(row, columns).map(|(&block, _)| block)
     }
 
     fn range(
         &self,
         row: i32,
-        (low, high): (i32, i32),
+        columns: RangeInclusive<i32>,
     ) -> impl Iterator<Item = (&Block, &BlockChanges)> {
+        let (low, high) = columns.into_inner();
         let at = |column| Block { row, column };
         let found = (low <= high).then(|| self.blocks.range(at(low)..=at(high)));
         found.into_iter().flatten()

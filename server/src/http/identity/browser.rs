@@ -34,7 +34,18 @@ fn name_of(cookie: &str, is_tls: bool) -> String {
     format!("{prefix}{cookie}")
 }
 
-fn cookie((name, same_site): (&str, &str), is_tls: bool, value: &str, lasts_s: i64) -> HeaderValue {
+/// Cookies that are set.
+#[derive(Clone, Copy)]
+enum CookieKind {
+    Session,
+    SignIn,
+}
+
+fn cookie(kind: CookieKind, is_tls: bool, value: &str, lasts_s: i64) -> HeaderValue {
+    let (name, same_site) = match kind {
+        CookieKind::Session => (COOKIE, "Strict"),
+        CookieKind::SignIn => (SIGN_IN_COOKIE, "Lax"),
+    };
     let secure = if is_tls { "; Secure" } else { "" };
     let name = name_of(name, is_tls);
     let text = format!(
@@ -51,7 +62,7 @@ pub(super) fn set_session_cookie(
     secret: &str,
     lasts_s: i64,
 ) {
-    let session = cookie((COOKIE, "Strict"), is_tls, secret, lasts_s);
+    let session = cookie(CookieKind::Session, is_tls, secret, lasts_s);
     headers.append(header::SET_COOKIE, session);
 }
 
@@ -63,7 +74,7 @@ pub(super) fn remove_session_cookie(headers: &mut HeaderMap, is_tls: bool) {
 /// Sets the cookie of a pending sign-in. The browser returns from the provider by a navigation from
 /// another site, with which `Strict` cookies are not sent.
 pub(super) fn set_sign_in_cookie(headers: &mut HeaderMap, is_tls: bool, value: &str, lasts_s: i64) {
-    let pending = cookie((SIGN_IN_COOKIE, "Lax"), is_tls, value, lasts_s);
+    let pending = cookie(CookieKind::SignIn, is_tls, value, lasts_s);
     headers.append(header::SET_COOKIE, pending);
 }
 

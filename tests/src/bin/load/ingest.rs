@@ -102,7 +102,11 @@ pub(crate) async fn measure(
     let end = begin + Duration::from_secs(arguments.seconds);
     let mut working = JoinSet::new();
     for (index, robot) in robots.into_iter().enumerate() {
-        let plan = UploadPlan::new(arguments, pace, (index, robots_count))?;
+        let place = RobotPlace {
+            index,
+            count: robots_count,
+        };
+        let plan = UploadPlan::new(arguments, pace, place)?;
         working.spawn(async move { work(robot, plan, end).await });
     }
     let mut all = Tally::new()?;
@@ -176,6 +180,13 @@ impl Ingest {
     }
 }
 
+/// Place of a robot among all of them.
+#[derive(Clone, Copy)]
+struct RobotPlace {
+    index: usize,
+    count: usize,
+}
+
 #[derive(Clone, Copy)]
 struct UploadPlan {
     records: usize,
@@ -190,7 +201,7 @@ impl UploadPlan {
     fn new(
         arguments: &Arguments,
         pace: Pace,
-        (index, count): (usize, usize),
+        RobotPlace { index, count }: RobotPlace,
     ) -> anyhow::Result<Self> {
         let per_second = match pace {
             Pace::PerSecond(per_second) => per_second,
