@@ -1,5 +1,6 @@
 //! No function takes two arguments of one type, which a caller could exchange without an error of the
-//! compiler: see `swappable-arguments.txt` for the exceptions.
+//! compiler: see `swappable-arguments.txt` for the exceptions. Nor does a parameter take apart a tuple
+//! with two elements of one type.
 //!
 //! Functions of tests do not count, nor do implementations of traits: the trait's own function does.
 //! Types are compared as they are written, but for those that take a text of any type, such as
@@ -92,25 +93,47 @@ fn are_exchangeable(one: &str, other: &str) -> bool {
     one == other || (is_any(one) && is_text(other)) || (is_text(one) && is_any(other))
 }
 
+/// Whether two values of these types could be exchanged.
+fn has_exchangeable<'of>(types: impl IntoIterator<Item = &'of syn::Type>) -> bool {
+    let types: Vec<String> = types.into_iter().map(text_of).collect();
+    let mut pairs = types.iter().enumerate();
+    pairs.any(|(place, one)| {
+        let mut later = types[place + 1..].iter();
+        later.any(|other| are_exchangeable(one, other))
+    })
+}
+
+/// Whether a pattern takes apart a tuple whose elements could be exchanged.
+fn takes_swappable_tuple(pattern: &syn::Pat, of: &syn::Type) -> bool {
+    match (pattern, of) {
+        (syn::Pat::Reference(pattern), syn::Type::Reference(of)) => {
+            takes_swappable_tuple(&pattern.pat, &of.elem)
+        }
+        (syn::Pat::Tuple(_), syn::Type::Reference(of)) => takes_swappable_tuple(pattern, &of.elem),
+        (syn::Pat::Tuple(pattern), syn::Type::Tuple(of)) => {
+            let mut elements = pattern.elems.iter().zip(&of.elems);
+            has_exchangeable(&of.elems)
+                || elements.any(|(element, of)| takes_swappable_tuple(element, of))
+        }
+        _ => false,
+    }
+}
+
 /// Finds the functions with two arguments of one type.
 #[derive(Default)]
 struct Swappable(Vec<String>);
 
 impl Swappable {
     fn check(&mut self, signature: &syn::Signature) {
-        let types: Vec<String> = signature
-            .inputs
-            .iter()
-            .filter_map(|input| match input {
-                syn::FnArg::Typed(input) => Some(text_of(&input.ty)),
+        let typed = || {
+            signature.inputs.iter().filter_map(|input| match input {
+                syn::FnArg::Typed(input) => Some(input),
                 syn::FnArg::Receiver(_) => None,
             })
-            .collect();
-        let mut pairs = types.iter().enumerate();
-        if pairs.any(|(place, one)| {
-            let mut later = types[place + 1..].iter();
-            later.any(|other| are_exchangeable(one, other))
-        }) {
+        };
+        if has_exchangeable(typed().map(|input| &*input.ty))
+            || typed().any(|input| takes_swappable_tuple(&input.pat, &input.ty))
+        {
             self.0.push(signature.ident.to_string());
         }
     }
@@ -155,6 +178,15 @@ fn swappable_of(text: &str) -> Vec<String> {
     found.0
 }
 
+/// Returns the lines on which functions of a name begin, with `/` between them.
+fn lines_of(text: &str, function: &str) -> String {
+    let begins = [format!("fn {function}("), format!("fn {function}<")];
+    let numbered = text.lines().zip(1_u32..);
+    let found = numbered.filter(|(line, _)| begins.iter().any(|begin| line.contains(begin)));
+    let found: Vec<String> = found.map(|(_, number)| number.to_string()).collect();
+    found.join("/")
+}
+
 /// Whether a file is compiled into the product or the lab, by its path.
 fn is_of_product(name: &str) -> bool {
     let mut folders = name.split('/');
@@ -179,12 +211,29 @@ fn two_arguments_of_one_type_are_found_and_others_are_not() {
         impl X { fn method(&self, a: u8, b: u8) {} }
         trait T { fn of_trait(&self, a: &mut Vec<u8>, b: &mut Vec<u8>); }
         #[cfg(test)] mod tests { fn helper(a: u8, b: u8) {} }
+        fn tuple((from_m, mut to_m): (f64, f64), at: Duration) {}
+        fn of_references((one, two): &(u8, u8), &(_, _, last): &(u8, bool, u8)) {}
+        fn nested((at, (x, y)): (u8, (f64, f64))) {}
+        fn mixed((x, at): (f64, Duration), pair: (u8, u8), (list, _): (&[(u8, u8)], u8)) {
+            let closure = |(a, b): (u8, u8)| a + b;
+        }
     ";
+    let expected = [
+        "swapped",
+        "borrowed",
+        "texts",
+        "shown",
+        "method",
+        "of_trait",
+        "tuple",
+        "of_references",
+        "nested",
+    ];
+    assert_eq!(swappable_of(text), expected);
+    assert_eq!(lines_of(text, "swapped"), "2");
     assert_eq!(
-        swappable_of(text),
-        [
-            "swapped", "borrowed", "texts", "shown", "method", "of_trait"
-        ]
+        lines_of("fn a() {}\nfn ab() {}\nasync fn a<T>()", "a"),
+        "1/3"
     );
 }
 
@@ -210,11 +259,12 @@ fn no_function_takes_two_arguments_that_could_be_exchanged() {
     for name in &names {
         let text = fs::read_to_string(root().join(name)).unwrap();
         for function in swappable_of(&text) {
+            let lines = lines_of(&text, &function);
             let key = (name.clone(), function);
             if let Some(is_used) = reasons.get_mut(&key) {
                 *is_used = true;
             } else {
-                let _ = writeln!(faults, "{name}: {}", key.1);
+                let _ = writeln!(faults, "{name}:{lines}: {}", key.1);
             }
         }
     }
