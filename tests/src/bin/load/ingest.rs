@@ -102,11 +102,8 @@ pub(crate) async fn measure(
     let end = begin + Duration::from_secs(arguments.seconds);
     let mut working = JoinSet::new();
     for (index, robot) in robots.into_iter().enumerate() {
-        let place = RobotPlace {
-            index,
-            count: robots_count,
-        };
-        let plan = UploadPlan::new(arguments, pace, place)?;
+        let count = robots_count;
+        let plan = UploadPlan::new(arguments, pace, RobotPlace { index, count })?;
         working.spawn(async move { work(robot, plan, end).await });
     }
     let mut all = Tally::new()?;
