@@ -386,6 +386,12 @@ impl Hypothesis {
         self.scale().variances(prior)
     }
 
+    /// Returns the variance of ln K from bends of the friction curve that the prior makes too
+    /// improbable.
+    pub(super) fn other_bend_variance(&self, prior: &Prior) -> f64 {
+        self.scale().other_bend_variance(prior)
+    }
+
     /// Returns the variance of ln K before the step at the end of the last block, infinite before
     /// the first one. The detection of changes needs it: the step by a block of new ground deletes
     /// most information on the old one.

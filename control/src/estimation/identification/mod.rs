@@ -24,6 +24,8 @@ mod segment;
 mod simulation;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tyre_tests;
 mod wheel_noise;
 
 use super::payload::STANDING_M_S;
@@ -75,8 +77,8 @@ const MODEL_TORQUE_MU: f64 = 0.025;
 /// the model's equations: a relative one, of ln θ, and an absolute one, of θ, which is a slip per
 /// friction coefficient and dominates where θ is small: without and with measured torque, which
 /// shows some of what the equations miss.
-const MODEL_LN_THETA_STD_DEV: f64 = 0.04;
-const MODEL_THETA_STD_DEVS: [f64; 2] = [0.020, 0.014];
+const MODEL_LN_THETA_STD_DEV: f64 = 0.05;
+const MODEL_THETA_STD_DEVS: [f64; 2] = [0.014, 0.010];
 /// Minimum duration of the block with which a segment ends, seconds; a shorter one is not used.
 const SHORT_BLOCK_S: f64 = 0.5;
 /// Minimum of the mean square of a channel's standardised residuals in its weights, without and
@@ -585,7 +587,7 @@ impl Identification {
         }
         let least = self.least_cost();
         let cost_scale = COST_SCALE * self.residual_square();
-        let (mut weights, mut mean, mut square, mut known) = (0.0, 0.0, 0.0, 0.0);
+        let (mut weights, mut mean, mut square, mut known, mut bend) = (0.0, 0.0, 0.0, 0.0, 0.0);
         for hypothesis in &self.hypotheses {
             let weight = (-(hypothesis.cost() - least) / cost_scale).exp();
             let value = hypothesis.values()[index::STIFFNESS];
@@ -594,18 +596,20 @@ impl Identification {
             mean += weight * value;
             square += weight * (variance + value * value);
             known += weight * of_prior;
+            bend += weight * hypothesis.other_bend_variance(&self.prior);
         }
         mean /= weights;
         let variance = square / weights - mean * mean;
         let of_prior = (known / weights).min(variance);
         let is_known = mean.is_finite() && variance.is_finite() && variance > 0.0;
         let theta = (-mean).exp();
-        let model = MODEL_THETA_STD_DEVS[usize::from(self.has_torque)];
+        let absolute = MODEL_THETA_STD_DEVS[usize::from(self.has_torque)] / theta;
+        let tyres = MODEL_LN_THETA_STD_DEV.powi(2) + absolute.powi(2) + bend / weights;
         is_known.then(|| Identified {
             theta,
             own_ratio: (variance - of_prior).max(0.0).sqrt(),
             robot_ratio: of_prior.max(0.0).sqrt(),
-            tyres_ratio: MODEL_LN_THETA_STD_DEV.hypot(model / theta),
+            tyres_ratio: tyres.sqrt(),
             duration_s: f64::from(best.age()) * BLOCK_S,
         })
     }
