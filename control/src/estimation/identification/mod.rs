@@ -98,8 +98,8 @@ pub(super) struct Identified {
     pub(super) own_ratio: f64,
     /// Part from the prior of the robot's other parameters; common to all estimates of the robot.
     pub(super) robot_ratio: f64,
-    /// Part from tyres and ground that do not follow the model's equations; common to all robots
-    /// with these tyres.
+    /// Part from tyres and ground that do not follow the model's equations, and from bends of the
+    /// friction curve that the prior makes too improbable; common to all robots with these tyres.
     pub(super) tyres_ratio: f64,
     /// Duration of the measurements in the estimate, seconds.
     pub(super) duration_s: f64,

@@ -22,7 +22,8 @@ impl Identification {
     /// large.
     ///
     /// θ is linearised in ln K about the ground's estimate, `θ = θ_g (1 − ln K + ln K_g)`: so the
-    /// noise of short segments has mean zero and averages out in a weighted mean.
+    /// noise of short segments has mean zero and averages out in a weighted mean. The error of the
+    /// tyres is that of the whole ground's estimate.
     pub(in super::super) fn close_segment(&mut self) -> Option<Identified> {
         if self.block_s >= SHORT_BLOCK_S {
             self.end_block();
