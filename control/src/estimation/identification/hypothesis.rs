@@ -386,10 +386,10 @@ impl Hypothesis {
         self.scale().variances(prior)
     }
 
-    /// Returns the variance of ln K from bends of the friction curve that the prior makes too
-    /// improbable.
-    pub(super) fn other_bend_variance(&self, prior: &Prior) -> f64 {
-        self.scale().other_bend_variance(prior)
+    /// Returns the variance by which the interval of ln K is inflated because the prior of the
+    /// friction curve's bend is too narrow.
+    pub(super) fn bend_variance_inflation(&self, prior: &Prior) -> f64 {
+        self.scale().bend_variance_inflation(prior)
     }
 
     /// Returns the variance of ln K before the step at the end of the last block, infinite before

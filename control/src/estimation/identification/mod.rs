@@ -98,8 +98,8 @@ pub(super) struct Identified {
     pub(super) own_ratio: f64,
     /// Part from the prior of the robot's other parameters; common to all estimates of the robot.
     pub(super) robot_ratio: f64,
-    /// Part from tyres and ground that do not follow the model's equations, and from bends of the
-    /// friction curve that the prior makes too improbable; common to all robots with these tyres.
+    /// Part from tyres and ground that do not follow the model's equations, and from a bend of the
+    /// friction curve outside its prior; common to all robots with these tyres.
     pub(super) tyres_ratio: f64,
     /// Duration of the measurements in the estimate, seconds.
     pub(super) duration_s: f64,
@@ -596,7 +596,7 @@ impl Identification {
             mean += weight * value;
             square += weight * (variance + value * value);
             known += weight * of_prior;
-            bend += weight * hypothesis.other_bend_variance(&self.prior);
+            bend += weight * hypothesis.bend_variance_inflation(&self.prior);
         }
         mean /= weights;
         let variance = square / weights - mean * mean;

@@ -140,9 +140,9 @@ const LN_PEAK: (f64, f64) = (-0.6, 0.4);
 /// Means and standard deviations of the curve's shape, `1/n` and `a`.
 const SHAPE: (f64, f64) = (0.3, 0.2);
 const BEND: (f64, f64) = (0.25, 0.35);
-/// Standard deviation of the bend in intervals, which contain more tyres than the estimate is drawn
-/// to: a `LuGre` contact without length has the bend 1, with n = 2.
-pub(super) const BEND_OF_INTERVALS_STD_DEV: f64 = 0.6;
+/// Standard deviation of the bend that intervals assume, wider than that of the estimate's prior: a
+/// `LuGre` contact without length has the bend 1, with n = 2.
+pub(super) const INTERVAL_BEND_STD_DEV: f64 = 0.6;
 /// Minimum of `1/n`, at which the curve is practically straight up to its peak.
 pub(super) const SHAPE_MIN: f64 = 0.05;
 /// Standard deviation of the centre of mass's forward position, relative to the wheelbase.

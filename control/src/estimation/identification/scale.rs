@@ -9,7 +9,7 @@
 //! that of the longer one (the specification test of Hausman, Econometrica 46, 1978).
 
 use super::model::CHANNELS;
-use super::parameters::{BEND_OF_INTERVALS_STD_DEV, Prior, Square, Values, index};
+use super::parameters::{INTERVAL_BEND_STD_DEV, Prior, Square, Values, index};
 
 /// Fraction of its information that a block loses with each later block, because sensor offsets
 /// drift.
@@ -331,14 +331,14 @@ impl TimeScale {
         self.last.multiply(ratio);
     }
 
-    /// Returns the variance that ln K gets in addition if the bend of the friction curve has the
-    /// standard deviation [`BEND_OF_INTERVALS_STD_DEV`] instead of that of the prior.
+    /// Returns the increase of the variance of ln K if the bend of the friction curve has the standard
+    /// deviation [`INTERVAL_BEND_STD_DEV`] instead of that of the prior.
     ///
     /// An error e of a prior mean with the standard deviation σ is an error `C_b e / σ²` of ln K,
     /// with the covariance `C_b` of both. The estimate stays, so no other error changes.
-    pub(super) fn other_bend_variance(&self, prior: &Prior) -> f64 {
+    pub(super) fn bend_variance_inflation(&self, prior: &Prior) -> f64 {
         let assumed = prior.std_devs[index::BEND].powi(2);
-        let added = (BEND_OF_INTERVALS_STD_DEV.powi(2) - assumed).max(0.0);
+        let added = (INTERVAL_BEND_STD_DEV.powi(2) - assumed).max(0.0);
         (self.stiffness_covariance[index::BEND] / assumed).powi(2) * added
     }
 
