@@ -71,17 +71,23 @@ test('an alert, the time of the friction layer and the times that it compares ar
 test('a reload brings back what the tab kept, an address from elsewhere what it says', () => {
   const bare = { ...place, draft: null, robot: null };
   const [own, other] = [`#${addressOf(bare)}`, '#site=yard&robot=rover-7'];
-  const tab = { place: addressOf(place, Infinity), address: own };
+  const tab = { place: addressOf(place, Infinity), address: own, isReload: false };
   // The address was read before the last change was in it.
   expect(placeAtStart(own, tab)).toEqual(place);
   expect(placeAtStart('', tab)).toEqual(place);
   expect(placeAtStart(other, tab)).toEqual(placeOf(other));
-  expect(placeAtStart(own, { place: '', address: null })).toEqual(bare);
-  expect(placeAtStart(own, { place: '', address: own })).toEqual(bare);
+  expect(placeAtStart(own, { place: '', address: null, isReload: true })).toEqual(bare);
+  expect(placeAtStart(own, { place: '', address: own, isReload: true })).toEqual(bare);
+  // The address changed after the reload had begun.
+  const newer = { ...tab, address: `#${addressOf(place)}`, isReload: true };
+  expect(placeAtStart(own, newer)).toEqual(place);
+  expect(placeAtStart(own, { ...newer, isReload: false })).toEqual(bare);
+  // The page that went had not brought its address back yet, or crashed.
+  expect(placeAtStart(own, { ...newer, address: null })).toEqual(bare);
   // A draft that is too long for the address.
   const long = { ...place, draft };
   const short = `#${addressOf(long, 1)}`;
-  expect(placeAtStart(short, { place: addressOf(long, Infinity), address: other })).toEqual(long);
+  expect(placeAtStart(short, { place: addressOf(long, Infinity), address: other, isReload: false })).toEqual(long);
 });
 
 test('an address that says nothing of the friction layer shows it', () => {

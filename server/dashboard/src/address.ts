@@ -172,16 +172,19 @@ export function placeOf(address: string): Place {
 export interface KeptByTab {
   place: string;
   address: string | null;
+  /** Whether the page was loaded by a reload. */
+  isReload: boolean;
 }
 
 /**
  * What a page that starts brings back. An address from elsewhere counts. The tab's own gives way to what the tab kept,
- * which is newer and has drafts that are too long for an address: browsers reload the address that a page had before
- * it began to go.
+ * which is newer and has drafts that are too long for an address: browsers reload the address that a page had when
+ * the reload began, and the page goes on until the server has answered.
  */
 export function placeAtStart(hash: string, tab: KeptByTab): Place {
   const kept = placeOf(tab.place);
-  if (!hash.includes('=') || (hash === tab.address && kept.site)) return kept;
+  const isOwn = tab.address !== null && (tab.isReload || hash === tab.address);
+  if (!hash.includes('=') || (isOwn && kept.site)) return kept;
   const place = placeOf(hash);
   const bare = (place: Place) => addressOf({ ...place, draft: null });
   if (!place.draft && bare(kept) === bare(place)) place.draft = kept.draft;

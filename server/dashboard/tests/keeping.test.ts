@@ -2,7 +2,7 @@
 import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
 import type { Mission, Page as ApiPage } from './types';
-import { api, browser, eventually, map, metresAt, select, shot, windowOf } from './harness';
+import { api, browser, eventually, map, metresAt, select, server, shot, windowOf } from './harness';
 
 const { open } = browser();
 
@@ -93,6 +93,28 @@ test('what was selected just before a reload is selected after it', async () => 
     await isBack;
     await page.getByRole('heading', { name: robot }).waitFor();
   }
+});
+
+test('what is selected while a slow server answers a reload is selected after it', async () => {
+  const page = await open();
+  await page.getByRole('tab', { name: 'Robots' }).click();
+  await says(page, 'site=yard');
+  let answer: () => void = () => undefined;
+  const isAnswered = new Promise<void>((resolve) => (answer = resolve));
+  await page.route(`${server()}/`, async (route) => {
+    await isAnswered;
+    await route.continue();
+  });
+  const isBack = page.waitForEvent('domcontentloaded');
+  // In the page itself, since Playwright waits for the reload before it clicks.
+  await page.evaluate(async () => {
+    location.reload();
+    document.querySelector<HTMLElement>('button[data-robot="rover-3"]')?.click();
+    while (!location.hash.includes('robot=rover-3')) await new Promise((resolve) => setTimeout(resolve, 10));
+  });
+  answer();
+  await isBack;
+  await page.getByRole('heading', { name: 'rover-3' }).waitFor();
 });
 
 test('a robot that is open, a tab, and what a mission is replaced by survive a reload', async () => {

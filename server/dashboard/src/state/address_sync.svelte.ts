@@ -30,7 +30,10 @@ export class AddressSync {
     this.#wanted = placeAtStart(location.hash, {
       place: sessionStorage.getItem(TAB_KEY) ?? '',
       address: sessionStorage.getItem(LAST_ADDRESS_KEY),
+      isReload: isReload(),
     });
+    // It is of this start alone: a page that crashes keeps none.
+    sessionStorage.removeItem(LAST_ADDRESS_KEY);
     this.#address = location.hash;
     fleet.wantedSite = this.#wanted.site;
   }
@@ -146,4 +149,10 @@ export class AddressSync {
     this.#address = location.hash;
     sessionStorage.setItem(TAB_KEY, addressOf(place, Infinity));
   }
+}
+
+/** Returns whether this page was loaded by a reload. */
+function isReload(): boolean {
+  const [navigation] = performance.getEntriesByType('navigation');
+  return navigation instanceof PerformanceNavigationTiming && navigation.type === 'reload';
 }
