@@ -92,6 +92,19 @@ test('an address that names an alert shows and marks it, whether it stands or is
   await none.locator('#panel .problem').waitFor();
 });
 
+test('an address of another site that is put into the page is opened by a reload', async () => {
+  const page = await open({ as: null, address: `${own.address}/#site=yard` });
+  await page.getByLabel('Token').fill(own.token);
+  await page.getByRole('button', { name: 'Sign in' }).click();
+  await page.locator('button[data-robot="rover-1"]').click();
+  await eventually('the robot in the address', async () => page.url().includes('robot=rover-1'));
+  await page.evaluate(() => {
+    location.hash = '#site=quarry&robot=digger-1';
+    location.reload();
+  });
+  await page.getByRole('heading', { name: 'Big digger' }).waitFor();
+});
+
 test('all alerts that are shown are acknowledged together', async () => {
   const both = [
     { site: 'yard', robot: 'rover-1', stop: await stop('yard', 'rover-1') },

@@ -10,7 +10,7 @@ import type { View } from './view.svelte';
 const WRITE_MS = 200;
 /** The whole of it, as long as it may be, for the tab alone: for long drafts, and over a sign-in elsewhere. */
 const TAB_KEY = 'tread-place';
-/** The address that the tab had when its page went: what is reloaded is this one, whatever was put in at the end. */
+/** The address that the page had put in last when it went; none if somebody has put in another one since. */
 const LAST_ADDRESS_KEY = 'tread-address';
 
 export class AddressSync {
@@ -32,7 +32,7 @@ export class AddressSync {
       address: sessionStorage.getItem(LAST_ADDRESS_KEY),
       isReload: isReload(),
     });
-    // It is of this start alone: a page that crashes keeps none.
+    // For this start alone: a page that crashes leaves none, and its address counts.
     sessionStorage.removeItem(LAST_ADDRESS_KEY);
     this.#address = location.hash;
     fleet.wantedSite = this.#wanted.site;
@@ -79,7 +79,8 @@ export class AddressSync {
     else if (place.alert && (place.site === null || this.fleet.sites.some(({ id }) => id === place.site))) {
       if (place.site !== null) this.fleet.choose(place.site);
       this.#openAlert(place);
-    }
+    } else return;
+    this.#address = location.hash;
   }
 
   #openAlert({ tab, alert }: Place): void {
@@ -134,11 +135,11 @@ export class AddressSync {
   /** Before the page goes. */
   flush(): void {
     clearTimeout(this.#due);
-    if (this.fleet.site && !this.#wanted) {
+    if (this.fleet.site && !this.#wanted && location.hash === this.#address) {
       sessionStorage.setItem(LAST_ADDRESS_KEY, this.#address);
       this.#put(this.place);
     } else {
-      // What the address wants was not brought back yet, so it is not this tab's own.
+      // What the address wants was not brought back, so it is not this tab's own.
       sessionStorage.removeItem(LAST_ADDRESS_KEY);
     }
   }
