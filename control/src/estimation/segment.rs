@@ -76,6 +76,8 @@ pub(super) struct StatedInformation {
     information: f64,
     /// True variance of θ fused from these segments, V ≤ 1/W.
     variance: f64,
+    /// Standard deviation of the tyres' part of its error.
+    tyres: f64,
 }
 
 impl StatedInformation {
@@ -105,17 +107,21 @@ impl StatedInformation {
     }
 
     /// Returns θ of an identified segment with the information that it states. Its own error is
-    /// independent of those of other segments.
+    /// independent of those of other segments; the error of the tyres, which may become smaller
+    /// while more of their friction curve is known, has the correlation 1.
     pub(super) fn identified(&mut self, found: &Identified) -> SegmentTheta {
-        let [own, tyres] =
-            [found.own_ratio, found.tyres_ratio].map(|ratio| (ratio * found.theta).powi(2));
+        let [own, tyres] = [found.own_ratio, found.tyres_ratio].map(|ratio| ratio * found.theta);
+        let information = self.add(SegmentVariance {
+            total: own.powi(2) + tyres.powi(2),
+            shared: self.tyres * tyres,
+        });
+        if self.information > 0.0 {
+            self.tyres += information / self.information * (tyres - self.tyres);
+        }
         SegmentTheta {
             theta: found.theta,
-            information: self.add(SegmentVariance {
-                total: own + tyres,
-                shared: tyres,
-            }),
-            own_information: own.recip(),
+            information,
+            own_information: own.powi(-2),
             common_ratio: CommonError {
                 robot: found.robot_ratio,
                 tyres: found.tyres_ratio,
@@ -198,6 +204,31 @@ mod tests {
             }
             let information: f64 = weights.iter().sum();
             prop_assert!(variance_sum <= information * (1.0 + 1.0e-9));
+        }
+
+        #[test]
+        fn segments_never_claim_more_than_their_sum_keeps_while_the_tyres_become_known(
+            segments in prop::collection::vec((0.01..0.3_f64, 0.01..0.3_f64), 1..20),
+            theta in 0.1..2.0_f64,
+        ) {
+            let mut stated = StatedInformation::default();
+            let (mut information, mut own_variance, mut tyres_std_dev) = (0.0, 0.0, 0.0);
+            for (own_ratio, tyres_ratio) in segments {
+                let found = stated.identified(&Identified {
+                    theta,
+                    own_ratio,
+                    robot_ratio: 0.1,
+                    tyres_ratio,
+                    tyre_prior_ratio: 0.0,
+                    duration_s: 10.0,
+                });
+                information += found.information;
+                own_variance += (found.information * own_ratio * theta).powi(2);
+                tyres_std_dev += found.information * tyres_ratio * theta;
+            }
+            // Of the sum of all θ, weighted by their information.
+            let variance = own_variance + tyres_std_dev * tyres_std_dev;
+            prop_assert!(variance <= information * (1.0 + 1.0e-9));
         }
 
         #[test]

@@ -66,8 +66,11 @@ pub(super) struct SegmentEstimate {
     /// segments.
     pub(super) own: f64,
     /// Variance of ln K from the uncertainty of all other parameters, which come from the ground's
-    /// other blocks and the prior; common to the segments of a robot.
-    pub(super) known: f64,
+    /// other blocks and the prior, without that from the tyres' prior; common to the segments of a
+    /// robot.
+    pub(super) of_robot: f64,
+    /// Variance of ln K from the prior of the tyres.
+    pub(super) of_tyres: f64,
 }
 
 /// Output of one channel, and that of the model with noise added to the wheel speeds.
@@ -386,6 +389,11 @@ impl Hypothesis {
         self.scale().variances(prior)
     }
 
+    /// Returns the part of ln K's variance that the prior of the tyres contributes.
+    pub(super) fn tyre_variance(&self, prior: &Prior) -> f64 {
+        self.scale().tyre_variance(prior)
+    }
+
     /// Returns the variance by which the interval of ln K is inflated because the prior of the
     /// friction curve's bend is too narrow.
     pub(super) fn bend_variance_inflation(&self, prior: &Prior) -> f64 {
@@ -464,12 +472,15 @@ impl Hypothesis {
             (ground.information * scale.stiffness_covariance).dot(&scale.stiffness_covariance);
         let scatter = (scale.scattered() / whole).max(1.0);
         let own = scatter * (segment.information * of_stiffness).dot(&of_stiffness);
+        let known = (others * of_stiffness).dot(&of_stiffness);
+        let of_tyres = prior.tyre_variance(&of_stiffness);
         let found = SegmentEstimate {
             ln_stiffness: values[index::STIFFNESS],
             own,
-            known: (others * of_stiffness).dot(&of_stiffness).max(0.0),
+            of_robot: (known - of_tyres).max(0.0),
+            of_tyres,
         };
-        let is_known = found.ln_stiffness.is_finite() && found.known.is_finite() && own > 0.0;
+        let is_known = found.ln_stiffness.is_finite() && known.is_finite() && own > 0.0;
         (is_known && own.is_finite()).then_some(found)
     }
 
