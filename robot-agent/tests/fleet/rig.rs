@@ -5,7 +5,8 @@ use tread_agent::sim::scenario::Scenario;
 use tread_agent::{Agent, AgentConfig, RunningAgent};
 use tread_api::ids::{BootId, RobotId};
 
-use crate::support::{FakeServer, Memory, SharedMemory, eventually, free_port};
+use crate::ports::free_address;
+use crate::support::{FakeServer, Memory, SharedMemory, eventually};
 
 /// One test's server, agent and folder.
 pub(crate) struct Rig {
@@ -19,7 +20,7 @@ pub(crate) struct Rig {
 impl Rig {
     pub(crate) fn new() -> Self {
         Self {
-            port: free_port(),
+            port: free_address().port(),
             scenario: Scenario::built_in().unwrap(),
             robot: "rover-1".parse().unwrap(),
             folder: TempDir::new().unwrap(),

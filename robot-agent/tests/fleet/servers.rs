@@ -5,8 +5,9 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tread_agent::{Agent, AgentConfig, Servers};
 
+use crate::ports::free_address;
 use crate::rig::Rig;
-use crate::support::{FakeServer, SharedMemory, eventually, free_port};
+use crate::support::{FakeServer, SharedMemory, eventually};
 
 /// Time within which a robot is to be online at another server.
 const MOVE_MAX: Duration = Duration::from_secs(2);
@@ -22,7 +23,7 @@ impl Two {
     fn new() -> Self {
         Self {
             rig: Rig::new(),
-            port: free_port(),
+            port: free_address().port(),
             memory: SharedMemory::default(),
         }
     }

@@ -1,7 +1,6 @@
 //! A tiny server for agents under test: a real zenoh router with the two queryables, and a memory.
 
 use std::collections::BTreeMap;
-use std::net::TcpListener;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -99,14 +98,6 @@ pub(crate) struct FakeServer {
     pub(crate) refuses_starts: Arc<AtomicBool>,
     /// Uploads in CBOR are refused, as by an older server, which takes them for broken JSON.
     pub(crate) reads_json_alone: Arc<AtomicBool>,
-}
-
-pub(crate) fn free_port() -> u16 {
-    TcpListener::bind("127.0.0.1:0")
-        .unwrap()
-        .local_addr()
-        .unwrap()
-        .port()
 }
 
 pub(crate) fn site_of(scenario: &Scenario) -> SiteDefinition {

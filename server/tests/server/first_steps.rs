@@ -10,6 +10,7 @@ use reqwest::{Certificate, StatusCode};
 use serde_json::Value;
 
 use crate::harness::eventually;
+use crate::ports::free_address;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_tread-server");
 
@@ -27,12 +28,6 @@ fn text(output: &Output) -> String {
     let all = [&output.stdout, &output.stderr];
     all.map(|bytes| String::from_utf8_lossy(bytes).into_owned())
         .join("\n")
-}
-
-/// Ports that were free a moment ago.
-fn free_ports() -> [u16; 2] {
-    let held = [(); 2].map(|()| TcpListener::bind("127.0.0.1:0").unwrap());
-    held.map(|listener| listener.local_addr().unwrap().port())
 }
 
 fn mode(file: &Path) -> u32 {
@@ -89,7 +84,7 @@ fn authorities_client(folder: &Path) -> reqwest::Client {
 async fn a_server_is_set_up_by_one_command_and_examined_before_during_and_after() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let [http, zenoh] = free_ports();
+    let [http, zenoh] = [(); 2].map(|()| free_address().port());
     let (http, zenoh) = (format!("127.0.0.1:{http}"), format!("127.0.0.1:{zenoh}"));
     let init = [
         "init",

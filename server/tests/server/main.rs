@@ -67,6 +67,13 @@ mod page;
 #[cfg(test)]
 mod pictures;
 #[cfg(test)]
+#[path = "../../../tests/src/ports.rs"]
+#[expect(
+    unreachable_pub,
+    reason = "it is a public module of the crate of all tests"
+)]
+mod ports;
+#[cfg(test)]
 mod postgres;
 #[cfg(test)]
 mod program;

@@ -172,7 +172,8 @@ impl Hypothesis {
         self.scales.iter_mut().for_each(TimeScale::drop_block);
     }
 
-    fn scale(&self) -> &TimeScale {
+    /// Returns the normal equations at the time scale that is used.
+    pub(super) fn scale(&self) -> &TimeScale {
         &self.scales[self.used]
     }
 
@@ -387,17 +388,6 @@ impl Hypothesis {
     /// least the nominal variance, the diagonal element of C.
     pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {
         self.scale().variances(prior)
-    }
-
-    /// Returns the part of ln K's variance that the prior of the tyres contributes.
-    pub(super) fn tyre_variance(&self, prior: &Prior) -> f64 {
-        self.scale().tyre_variance(prior)
-    }
-
-    /// Returns the variance by which the interval of ln K is inflated because the prior of the
-    /// friction curve's bend is too narrow.
-    pub(super) fn bend_variance_inflation(&self, prior: &Prior) -> f64 {
-        self.scale().bend_variance_inflation(prior)
     }
 
     /// Returns the variance of ln K before the step at the end of the last block, infinite before

@@ -600,8 +600,8 @@ impl Identification {
             mean += weight * value;
             square += weight * (variance + value * value);
             known += weight * of_prior;
-            tyres += weight * hypothesis.tyre_variance(&self.prior);
-            bend += weight * hypothesis.bend_variance_inflation(&self.prior);
+            tyres += weight * hypothesis.scale().tyre_variance(&self.prior);
+            bend += weight * hypothesis.scale().bend_variance_inflation(&self.prior);
         }
         mean /= weights;
         let variance = square / weights - mean * mean;

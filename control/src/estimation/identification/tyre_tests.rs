@@ -4,6 +4,17 @@ use super::parameters::{Number, Robot, Values};
 use super::tests::{SAMPLE_S, Simulated, identification};
 use super::*;
 
+/// Drives for a minute, without torque sensors.
+fn drive_without_torque(identification: &mut Identification, robot: &mut Simulated) {
+    for _ in 0..6_000 {
+        let sample = SensorSample {
+            wheel_torques: None,
+            ..robot.sample()
+        };
+        identification.update(&sample, &SensorNoise::default(), SAMPLE_S);
+    }
+}
+
 /// ln(θ̂/θ) without torque sensors on ground of K 2, its standard deviation, and the estimate of the
 /// parameter `place`. `change` sets the robot's parameters, from the mean of the prior on; `assume`
 /// changes the estimator's prior.
@@ -20,13 +31,7 @@ fn identified_without_torque(
     assume(&mut identification.prior);
     identification.prior.reset();
     identification.begin(&State::rolling(Twist::default()));
-    for _ in 0..6_000 {
-        let sample = SensorSample {
-            wheel_torques: None,
-            ..robot.sample()
-        };
-        identification.update(&sample, &SensorNoise::default(), SAMPLE_S);
-    }
+    drive_without_torque(&mut identification, &mut robot);
     let found = identification.identified().expect("θ is excited");
     let std_dev = found
         .own_ratio
@@ -69,7 +74,7 @@ fn the_parts_of_the_variance_are_those_of_the_covariance_and_of_the_model() {
     let best = identification.best().expect("a hypothesis is left");
     let parts = found.own_ratio.powi(2) + found.robot_ratio.powi(2) + found.tyres_ratio.powi(2);
     let model = MODEL_LN_THETA_STD_DEV.powi(2) + (MODEL_THETA_STD_DEVS[1] / found.theta).powi(2);
-    let inflation = best.bend_variance_inflation(&identification.prior);
+    let inflation = best.scale().bend_variance_inflation(&identification.prior);
     let (variance, _) = best.variances(&identification.prior);
     let whole = variance + model + inflation;
     assert!((parts - whole).abs() < 1.0e-9, "{parts} {whole}");
@@ -258,16 +263,13 @@ fn on_lugre_tyres(stiffness: f64) -> (Identified, f64) {
         values[index::BEND] = 1.0;
     });
     let mut identification = identification();
-    for _ in 0..6_000 {
-        let sample = SensorSample {
-            wheel_torques: None,
-            ..robot.sample()
-        };
-        identification.update(&sample, &SensorNoise::default(), SAMPLE_S);
-    }
+    drive_without_torque(&mut identification, &mut robot);
     let found = identification.identified().expect("θ is excited");
     let best = identification.best().expect("a hypothesis is left");
-    (found, best.bend_variance_inflation(&identification.prior))
+    (
+        found,
+        best.scale().bend_variance_inflation(&identification.prior),
+    )
 }
 
 #[test]

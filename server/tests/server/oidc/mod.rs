@@ -14,8 +14,9 @@ use tread_api::identity::Role;
 use tread_api::rights::Right;
 use tread_server::config::oidc::{GroupConfig, OidcConfig};
 
-use self::provider::{Browser, Kind, PUBLIC, Provider, free_port, location};
+use self::provider::{Browser, Kind, PUBLIC, Provider, location};
 use crate::harness::{Yard, client, eventually};
+use crate::ports::free_address;
 
 /// A configuration for the provider at a port.
 fn config(port: u16, folder: &Path) -> OidcConfig {
@@ -98,7 +99,7 @@ async fn is_signed_in(browser: &mut Browser, answer: Response) -> Value {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     let paths = body(
@@ -197,7 +198,7 @@ async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_public_client_takes_es256_a_nested_claim_of_the_user_info_and_an_own_authority() {
-    let port = free_port();
+    let port = free_address().port();
     let folder = tempfile::tempdir().unwrap();
     let made = rcgen::generate_simple_self_signed(["127.0.0.1".to_owned()]).unwrap();
     let (certificate, key) = (
@@ -238,7 +239,7 @@ async fn a_public_client_takes_es256_a_nested_claim_of_the_user_info_and_an_own_
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_provider_that_is_down_keeps_nobody_out_who_has_a_token_and_is_found_later() {
-    let port = free_port();
+    let port = free_address().port();
     let yard = Yard::start_configured(|config, folder| {
         config.oidc = Some(self::config(port, folder));
     })

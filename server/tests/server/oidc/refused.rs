@@ -5,9 +5,10 @@ use std::time::Duration;
 use reqwest::{Response, StatusCode, Url, header};
 use tread_server::clock::Clock;
 
-use super::provider::{Browser, Kind, PUBLIC, Provider, free_port, location};
+use super::provider::{Browser, Kind, PUBLIC, Provider, location};
 use super::{body, config, is_found, is_signed_in, start};
 use crate::harness::{Yard, eventually};
+use crate::ports::free_address;
 
 /// Refused with a problem of a type, and nobody is signed in.
 async fn is_refused(browser: &mut Browser, answer: Response, kind: &str) -> String {
@@ -36,7 +37,7 @@ fn with(url: &str, name: &str, value: &str) -> String {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_answer_counts_once_and_in_the_browser_alone_in_which_the_sign_in_began() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     let mut browser = Browser::new(&yard);
@@ -86,7 +87,7 @@ async fn an_answer_counts_once_and_in_the_browser_alone_in_which_the_sign_in_beg
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_id_token_of_another_sign_in_is_not_believed() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     let mut browser = Browser::new(&yard);
@@ -107,7 +108,7 @@ async fn an_id_token_of_another_sign_in_is_not_believed() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn whoever_is_in_no_group_is_refused_with_that_reason_as_a_person_and_as_a_program() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     let mut browser = Browser::new(&yard);
@@ -157,7 +158,7 @@ async fn whoever_is_in_no_group_is_refused_with_that_reason_as_a_person_and_as_a
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_id_token_that_is_over_or_of_the_future_is_not_believed() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let now = Clock::system().now();
     for wall in [now + Duration::from_mins(7), now - Duration::from_mins(3)] {
@@ -199,7 +200,7 @@ async fn an_id_token_that_is_over_or_of_the_future_is_not_believed() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn no_address_sends_a_browser_elsewhere_after_the_sign_in() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     let mut browser = Browser::new(&yard);
@@ -215,7 +216,7 @@ async fn no_address_sends_a_browser_elsewhere_after_the_sign_in() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_browser_at_another_name_of_the_server_is_sent_to_the_one_that_the_provider_knows() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = Yard::start_configured(|config, folder| {
         config.oidc = Some(self::config(port, folder));
@@ -239,7 +240,7 @@ async fn a_browser_at_another_name_of_the_server_is_sent_to_the_one_that_the_pro
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_foreign_page_begins_no_sign_in() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     let mut browser = Browser::new(&yard);

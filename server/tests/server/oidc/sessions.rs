@@ -6,15 +6,16 @@ use reqwest::StatusCode;
 use serde_json::{Value, json};
 use tread_api::identity::Role;
 
-use super::provider::{Browser, Kind, Provider, free_port};
+use super::provider::{Browser, Kind, Provider};
 use super::{body, config, is_signed_in, start};
 use crate::events::read_until;
 use crate::harness::{Yard, client, eventually};
+use crate::ports::free_address;
 use crate::robot::Robot;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn somebody_in_several_groups_has_at_each_site_what_one_of_them_gives_there() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     yard.post("/v1/sites", &json!({"id": "field"})).await;
@@ -46,7 +47,7 @@ async fn somebody_in_several_groups_has_at_each_site_what_one_of_them_gives_ther
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_admin_lists_and_ends_sessions_within_his_scope_and_streams_close_at_once() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     let (mut anna, mut bert) = (Browser::new(&yard), Browser::new(&yard));
@@ -101,7 +102,7 @@ async fn an_admin_lists_and_ends_sessions_within_his_scope_and_streams_close_at_
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_outlives_a_restart_with_the_rights_that_the_configuration_gives_then() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     let mut browser = Browser::new(&yard);
@@ -138,7 +139,7 @@ async fn a_session_outlives_a_restart_with_the_rights_that_the_configuration_giv
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_person_has_one_share_of_sessions_and_is_never_called_like_a_token() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     // There is a token `tests`.
@@ -164,7 +165,7 @@ async fn a_person_has_one_share_of_sessions_and_is_never_called_like_a_token() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_token_that_is_made_with_the_name_of_a_person_is_distinguished_from_them_everywhere() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     let mut anna = Browser::new(&yard);
@@ -212,7 +213,7 @@ async fn a_token_that_is_made_with_the_name_of_a_person_is_distinguished_from_th
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_lasts_as_long_as_is_configured() {
-    let port = free_port();
+    let port = free_address().port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let folder = tempfile::tempdir().unwrap();
     let now = tread_server::clock::Clock::system().now();

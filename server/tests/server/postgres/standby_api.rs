@@ -1,7 +1,7 @@
 //! What a standby answers while another server has the database.
 
 use std::io::{BufRead as _, BufReader, Write as _};
-use std::net::{SocketAddr, TcpListener};
+use std::net::SocketAddr;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
@@ -27,6 +27,7 @@ use crate::events::{last_id, read_until, steps_in};
 use crate::harness::{Yard, circle, client, config, eventually, measured, segment};
 use crate::identity::browsers::{by_cookie, sign_in};
 use crate::map_blocks::{PATHS, answers_at, assert_same, at, drive};
+use crate::ports::free_address;
 use crate::robot::Robot;
 
 /// Time within which the map of a standby is that of the server after a receipt.
@@ -34,12 +35,6 @@ const FOLLOWED_MAX: Duration = Duration::from_secs(1);
 
 /// Missions that are created while a stream of events begins.
 const CONCURRENT: usize = 10;
-
-/// An address that nobody has.
-fn free_address() -> SocketAddr {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    listener.local_addr().unwrap()
-}
 
 /// A server with its standby.
 struct Pair {
