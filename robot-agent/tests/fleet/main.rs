@@ -8,12 +8,6 @@
 
 mod commands;
 mod control;
-#[path = "../../../tests/src/ports.rs"]
-#[expect(
-    unreachable_pub,
-    reason = "it is a public module of the crate of all tests"
-)]
-mod ports;
 mod recording;
 mod rig;
 mod safety;

@@ -5,8 +5,7 @@ use tread_agent::sim::scenario::Scenario;
 use tread_agent::{Agent, AgentConfig, RunningAgent};
 use tread_api::ids::{BootId, RobotId};
 
-use crate::ports::free_address;
-use crate::support::{FakeServer, Memory, SharedMemory, eventually};
+use crate::support::{FakeServer, Memory, SharedMemory, eventually, free_address};
 
 /// One test's server, agent and folder.
 pub(crate) struct Rig {

@@ -5,9 +5,8 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tread_agent::{Agent, AgentConfig, Servers};
 
-use crate::ports::free_address;
 use crate::rig::Rig;
-use crate::support::{FakeServer, SharedMemory, eventually};
+use crate::support::{FakeServer, SharedMemory, eventually, free_address};
 
 /// Time within which a robot is to be online at another server.
 const MOVE_MAX: Duration = Duration::from_secs(2);

@@ -1,5 +1,12 @@
 //! A tiny server for agents under test: a real zenoh router with the two queryables, and a memory.
 
+#[path = "../../../tests/src/ports.rs"]
+#[expect(
+    unreachable_pub,
+    reason = "it is a public module of the crate of all tests"
+)]
+mod ports;
+
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
@@ -24,6 +31,8 @@ use uuid::Uuid;
 use zenoh::Wait;
 use zenoh::query::{ConsolidationMode, Query};
 use zenoh::sample::SampleKind;
+
+pub(crate) use self::ports::free_address;
 
 /// Longest wait for anything in these tests.
 pub(crate) const WAIT_MAX: Duration = Duration::from_secs(30);
