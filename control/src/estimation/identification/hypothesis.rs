@@ -66,11 +66,8 @@ pub(super) struct SegmentEstimate {
     /// segments.
     pub(super) own: f64,
     /// Variance of ln K from the uncertainty of all other parameters, which come from the ground's
-    /// other blocks and the prior, without that from the tyres' prior; common to the segments of a
-    /// robot.
-    pub(super) of_robot: f64,
-    /// Variance of ln K from the prior of the tyres.
-    pub(super) of_tyres: f64,
+    /// other blocks and the prior; common to the segments of a robot.
+    pub(super) known: f64,
 }
 
 /// Output of one channel, and that of the model with noise added to the wheel speeds.
@@ -172,8 +169,7 @@ impl Hypothesis {
         self.scales.iter_mut().for_each(TimeScale::drop_block);
     }
 
-    /// Returns the normal equations at the time scale that is used.
-    pub(super) fn scale(&self) -> &TimeScale {
+    fn scale(&self) -> &TimeScale {
         &self.scales[self.used]
     }
 
@@ -390,6 +386,12 @@ impl Hypothesis {
         self.scale().variances(prior)
     }
 
+    /// Returns the variance by which the interval of ln K is inflated because the prior of the
+    /// friction curve's bend is too narrow.
+    pub(super) fn bend_variance_inflation(&self, prior: &Prior) -> f64 {
+        self.scale().bend_variance_inflation(prior)
+    }
+
     /// Returns the variance of ln K before the step at the end of the last block, infinite before
     /// the first one. The detection of changes needs it: the step by a block of new ground deletes
     /// most information on the old one.
@@ -462,15 +464,12 @@ impl Hypothesis {
             (ground.information * scale.stiffness_covariance).dot(&scale.stiffness_covariance);
         let scatter = (scale.scattered() / whole).max(1.0);
         let own = scatter * (segment.information * of_stiffness).dot(&of_stiffness);
-        let known = (others * of_stiffness).dot(&of_stiffness);
-        let of_tyres = prior.tyre_variance(&of_stiffness);
         let found = SegmentEstimate {
             ln_stiffness: values[index::STIFFNESS],
             own,
-            of_robot: (known - of_tyres).max(0.0),
-            of_tyres,
+            known: (others * of_stiffness).dot(&of_stiffness).max(0.0),
         };
-        let is_known = found.ln_stiffness.is_finite() && known.is_finite() && own > 0.0;
+        let is_known = found.ln_stiffness.is_finite() && found.known.is_finite() && own > 0.0;
         (is_known && own.is_finite()).then_some(found)
     }
 

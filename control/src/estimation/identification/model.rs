@@ -2,13 +2,8 @@
 //! speeds.
 //!
 //! State at the centre of mass, body frame: forward and left speed, turn rate; per contact a
-//! deflection s as a slip vector with `ℓ ṡ = (1 + q x) (v_slip − V s)` (relaxation length ℓ at zero
-//! slip: Pacejka, Tire and Vehicle Dynamics, ch. 7). With q = 0 the relaxation length is constant,
-//! with q = 1 it decreases like that of a `LuGre` contact without length; a contact that deflects
-//! like a spring is between them. `V = |u| + p (|v| − |u|)` lies between the rim speed u and the forward
-//! speed v of the wheel's centre: with p = 0 the steady s is the theoretical slip of brush models
-//! and of Yi et al. (2007), with p = 1 the practical slip over which the Magic Formula is fitted
-//! (Pacejka, ch. 3 and 4). A contact with the load N has the force `N K s / D`,
+//! deflection s as a slip vector with `ℓ ṡ = v_slip − |u| s` (relaxation length ℓ, rim speed u:
+//! Pacejka, Tire and Vehicle Dynamics, ch. 7). A contact with the load N has the force `N K s / D`,
 //! with `D = (1 + n a x + xⁿ)^(1/n)` and `x = K|s|/μ_p`: its slope is K = 1/θ at zero slip, and its
 //! friction coefficient approaches `μ_p` at large slip. a = 0 with a large n is the straight rise
 //! of Yi et al. (2007), eq. (7), up to the peak; a = 1/3 with n = 3 is within 4 % of a brush model;
@@ -35,9 +30,6 @@ const STANDING_DEFLECTION_MAX: f64 = 5.0;
 /// Rim speed over which rolling resistance and gear loss smoothly change their sign (`tanh`),
 /// metres per second.
 const RESISTANCE_SIGN_WIDTH_M_S: f64 = 0.01;
-/// Minimum of the speed that slip is relative to, over the rim speed: practical slip has no bound
-/// where wheels turn and the robot stands.
-const REFERENCE_MIN_RATIO: f64 = 0.05;
 /// Added to the square of slip, so that the root has a finite slope at zero.
 const SLIP_SQUARE_MIN: f64 = 1.0e-10;
 // Arrays of numbers are written out below: `map` copies them, and a copy of numbers with their
@@ -143,11 +135,6 @@ struct Forces<T> {
     sides_n: [T; 2],
 }
 
-/// Returns the magnitude of a deflection as slip, above 0.
-fn magnitude<T: Real>([forward, left]: [T; 2]) -> T {
-    (forward * forward + left * left + SLIP_SQUARE_MIN).sqrt()
-}
-
 /// Returns the acceleration by gravity along sloped ground in the body frame, forward and left,
 /// metres per second squared. The slope is the rise per distance along the x and y axes of a frame
 /// on the ground, in which the body has the heading `heading_rad`, counter-clockwise from x.
@@ -193,7 +180,7 @@ impl<T: Real> Robot<T> {
 
     /// Returns the friction coefficient over slip, `K / D`, at a slip above 0.
     fn mu_over_slip(&self, slip: T) -> T {
-        let x = self.per_peak_slip * slip;
+        let x = self.stiffness / self.peak * slip;
         let inside = (x.ln() * self.sharpness).exp() + self.sharpness * self.bend * x + 1.0;
         self.stiffness / (inside.ln() / self.sharpness).exp()
     }
@@ -218,24 +205,18 @@ impl<T: Real> Robot<T> {
         for (contact, deflection) in contacts.iter().zip(&mut state.deflections) {
             let [x_m, y_m] = contact.place_m;
             let rim_m_s = speeds_m_s[contact.side];
-            let centre_m_s = forward_m_s - turn * y_m;
-            let slips_m_s = [rim_m_s - centre_m_s, -(left_m_s + turn * x_m)];
-            let theoretical_m_s = rim_m_s.abs();
-            let mut reference_m_s =
-                theoretical_m_s + self.practical_slip * (centre_m_s.abs() - theoretical_m_s);
-            if reference_m_s.value() < REFERENCE_MIN_RATIO * theoretical_m_s.value() {
-                reference_m_s = theoretical_m_s * REFERENCE_MIN_RATIO;
-            }
-            let x = self.per_peak_slip * magnitude(*deflection);
-            let rate = rate * (self.relaxation_decrease * x + 1.0);
+            let slips_m_s = [
+                rim_m_s - (forward_m_s - turn * y_m),
+                -(left_m_s + turn * x_m),
+            ];
             // Trapezoidal in the deflection, which is stiff at short relaxation lengths.
-            let rolled = rate * reference_m_s * 0.5;
+            let rolled = rate * rim_m_s.abs() * 0.5;
             let (keeps, over) = (-rolled + 1.0, (rolled + 1.0).recip());
             for (part, slip_m_s) in deflection.iter_mut().zip(slips_m_s) {
                 *part = (*part * keeps + rate * slip_m_s) * over;
             }
             let [forward, left] = *deflection;
-            let slip = magnitude(*deflection);
+            let slip = (forward * forward + left * left + SLIP_SQUARE_MIN).sqrt();
             let mu_over_slip = self.mu_over_slip(slip);
             let per_slip_n = mu_over_slip * contact.load_n;
             let mut force_n = [per_slip_n * forward, per_slip_n * left];
@@ -248,7 +229,7 @@ impl<T: Real> Robot<T> {
                     force_n.iter_mut().zip(slips_m_s).zip(*deflection)
                 {
                     *force_n =
-                        *force_n + contact.load_n * damping * (slip_m_s - reference_m_s * part);
+                        *force_n + contact.load_n * damping * (slip_m_s - rim_m_s.abs() * part);
                 }
                 let most = STANDING_DEFLECTION_MAX * self.peak.value() / stiffness;
                 if slip.value() > most {

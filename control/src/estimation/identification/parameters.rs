@@ -7,10 +7,10 @@ use crate::estimation::{EstimatorPrior, SensorNoise};
 use crate::robot::RobotModel;
 
 /// Number of parameters.
-pub(super) const PARAMETERS: usize = 27;
+pub(super) const PARAMETERS: usize = 25;
 /// Number of parameters of the equations of motion and of the sensors' scales and offsets: all but
 /// the delays, which are the last ones.
-pub(super) const MODELLED: usize = 25;
+pub(super) const MODELLED: usize = 23;
 /// Values of all parameters.
 pub(super) type Values = SVector<f64, PARAMETERS>;
 /// Covariance or information of all parameters.
@@ -64,15 +64,10 @@ pub(super) mod index {
     pub(in super::super) const HEIGHT: usize = 21;
     /// Offset of the measured body speed, metres per second.
     pub(in super::super) const SPEED_OFFSET: usize = 22;
-    /// 0 for theoretical slip, which is relative to the rim speed, 1 for practical slip, which is
-    /// relative to the forward speed of the wheel's centre; p of the module `model`.
-    pub(in super::super) const PRACTICAL_SLIP: usize = 23;
-    /// Decrease of the relaxation length with slip, q of the module `model`.
-    pub(in super::super) const RELAXATION_DECREASE: usize = 24;
     /// Delay of the gyro relative to the wheel speeds, and of the accelerometer relative to the
     /// gyro, seconds.
-    pub(in super::super) const GYRO_DELAY: usize = 25;
-    pub(in super::super) const ACCELEROMETER_DELAY: usize = 26;
+    pub(in super::super) const GYRO_DELAY: usize = 23;
+    pub(in super::super) const ACCELEROMETER_DELAY: usize = 24;
 }
 
 /// Normal prior of the parameters at the start of a ground, in the units of [`index`].
@@ -96,14 +91,6 @@ impl Prior {
         self.information = Square::from_diagonal(&self.std_devs.map(|std_dev| std_dev.powi(-2)));
     }
 
-    /// Returns the variance that the prior of the tyres' parameters [`OF_TYRES`] contributes to a
-    /// parameter with these posterior covariances with all parameters. On each ground they start
-    /// from the initial prior, in which they are independent.
-    pub(super) fn tyre_variance(&self, covariances: &Values) -> f64 {
-        let contributed = |place: usize| (covariances[place] / self.std_devs[place]).powi(2);
-        OF_TYRES.into_iter().map(contributed).sum()
-    }
-
     /// Limits parameters to their ranges.
     pub(super) fn in_range(&self, mut values: Values) -> Values {
         for place in 0..PARAMETERS {
@@ -113,41 +100,25 @@ impl Prior {
         }
         values[index::SHAPE] = values[index::SHAPE].max(SHAPE_MIN);
         values[index::BEND] = values[index::BEND].max(0.0);
-        values[index::PRACTICAL_SLIP] = values[index::PRACTICAL_SLIP].clamp(0.0, 1.0);
-        values[index::RELAXATION_DECREASE] =
-            values[index::RELAXATION_DECREASE].clamp(0.0, RELAXATION_DECREASE_MAX);
         values
     }
 }
 
-/// Parameters of the tyres that start from the initial prior on each ground: the friction curve,
-/// the speed that slip is relative to, and the decrease of the relaxation length. All robots with
-/// the same tyres share the errors of their priors.
-pub(super) const OF_TYRES: [usize; 5] = [
-    index::PEAK,
-    index::SHAPE,
-    index::BEND,
-    index::PRACTICAL_SLIP,
-    index::RELAXATION_DECREASE,
-];
-
 /// Parameters of the ground and of the tyres' friction curve on it. They start from the initial
 /// prior on new ground.
-pub(super) const OF_GROUND: [usize; 9] = [
+pub(super) const OF_GROUND: [usize; 7] = [
     index::STIFFNESS,
     index::RESISTANCE,
     index::PEAK,
     index::SHAPE,
     index::BEND,
-    index::PRACTICAL_SLIP,
-    index::RELAXATION_DECREASE,
     index::SLOPE_X,
     index::SLOPE_Y,
 ];
 
 /// Parameters of the load and the ground. Both are reset with a new load, because the friction
 /// curve of the tyres after a stop that is long enough for loading may differ.
-pub(super) const OF_LOAD_AND_GROUND: [usize; 14] = [
+pub(super) const OF_LOAD_AND_GROUND: [usize; 12] = [
     index::MASS,
     index::INERTIA,
     index::CENTRE_FORWARD,
@@ -158,8 +129,6 @@ pub(super) const OF_LOAD_AND_GROUND: [usize; 14] = [
     index::PEAK,
     index::SHAPE,
     index::BEND,
-    index::PRACTICAL_SLIP,
-    index::RELAXATION_DECREASE,
     index::SLOPE_X,
     index::SLOPE_Y,
 ];
@@ -170,12 +139,7 @@ const LN_STIFFNESS: (f64, f64) = (1.1, 2.0);
 const LN_PEAK: (f64, f64) = (-0.6, 0.4);
 /// Means and standard deviations of the curve's shape, `1/n` and `a`.
 const SHAPE: (f64, f64) = (0.3, 0.2);
-const BEND: (f64, f64) = (0.3, 0.45);
-/// Mean and standard deviation of the part of practical slip.
-const PRACTICAL_SLIP: (f64, f64) = (0.25, 0.35);
-/// Mean, standard deviation and maximum of the relaxation length's decrease.
-const RELAXATION_DECREASE: (f64, f64) = (0.3, 0.35);
-const RELAXATION_DECREASE_MAX: f64 = 1.5;
+const BEND: (f64, f64) = (0.25, 0.35);
 /// Standard deviation of the bend that intervals assume, wider than that of the estimate's prior: a
 /// `LuGre` contact without length has the bend 1, with n = 2.
 pub(super) const INTERVAL_BEND_STD_DEV: f64 = 0.6;
@@ -254,8 +218,6 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
         (index::PEAK, LN_PEAK),
         (index::SHAPE, SHAPE),
         (index::BEND, BEND),
-        (index::PRACTICAL_SLIP, PRACTICAL_SLIP),
-        (index::RELAXATION_DECREASE, RELAXATION_DECREASE),
         (index::GYRO_OFFSET, (0.0, noise.gyro_offset_rad_s)),
         (
             index::FORWARD_OFFSET,
@@ -296,10 +258,7 @@ pub(super) struct Robot<T> {
     pub(super) inertia_kg_m2: T,
     /// Centre of mass from the wheels' centre: forward, left, up, metres.
     pub(super) centre_m: [T; 3],
-    /// Relaxation length at zero slip, metres.
     pub(super) relaxation_m: T,
-    /// Decrease of the relaxation length with slip.
-    pub(super) relaxation_decrease: T,
     pub(super) slope: [T; 2],
     /// Ratio of measured to true torque, left and right.
     pub(super) torque_scale: [T; 2],
@@ -310,13 +269,9 @@ pub(super) struct Robot<T> {
     /// Rolling radius, left and right, metres.
     pub(super) radius_m: [T; 2],
     pub(super) peak: T,
-    /// `K/μ_p`, the reciprocal of the slip at which a straight curve would reach `μ_p`.
-    pub(super) per_peak_slip: T,
     /// n of the curve.
     pub(super) sharpness: T,
     pub(super) bend: T,
-    /// 0 for theoretical, 1 for practical slip.
-    pub(super) practical_slip: T,
     pub(super) gyro_offset_rad_s: T,
     pub(super) acceleration_offset_m_s2: [T; 2],
     pub(super) speed_offset_m_s: T,
@@ -340,12 +295,11 @@ impl<T: Real> Robot<T> {
             T::constant(SHAPE_MIN.recip())
         };
         let bend = of(index::BEND);
-        let (stiffness, peak) = (of(index::STIFFNESS).exp(), of(index::PEAK).exp());
         Self {
             track_m,
             wheelbase_m,
             nominal_radius_m,
-            stiffness,
+            stiffness: of(index::STIFFNESS).exp(),
             mass_kg,
             inertia_kg_m2: (of(index::MASS) + of(index::INERTIA)).exp() * model.yaw_inertia_kg_m2(),
             centre_m: [
@@ -354,22 +308,19 @@ impl<T: Real> Robot<T> {
                 of(index::HEIGHT) * track_m,
             ],
             relaxation_m: of(index::RELAXATION).exp(),
-            relaxation_decrease: of(index::RELAXATION_DECREASE),
             slope: [of(index::SLOPE_X), of(index::SLOPE_Y)],
             torque_scale: [side(-1.0), side(1.0)],
             rotors_kg: of(index::ROTORS) * (0.5 * model.mass_kg()),
             gear_loss: of(index::GEAR_LOSS),
             resistance: of(index::RESISTANCE),
             radius_m: [radius(-0.5), radius(0.5)],
-            peak,
-            per_peak_slip: stiffness / peak,
+            peak: of(index::PEAK).exp(),
             sharpness,
             bend: if bend.value() < 0.0 {
                 T::constant(0.0)
             } else {
                 bend
             },
-            practical_slip: of(index::PRACTICAL_SLIP),
             gyro_offset_rad_s: of(index::GYRO_OFFSET),
             acceleration_offset_m_s2: [of(index::FORWARD_OFFSET), of(index::LEFT_OFFSET)],
             speed_offset_m_s: of(index::SPEED_OFFSET),

@@ -342,11 +342,6 @@ impl TimeScale {
         (self.stiffness_covariance[index::BEND] / assumed).powi(2) * added
     }
 
-    /// Returns the part of ln K's variance that the prior of the tyres contributes.
-    pub(super) fn tyre_variance(&self, prior: &Prior) -> f64 {
-        prior.tyre_variance(&self.stiffness_covariance)
-    }
-
     /// Returns the variance of ln K, and the part of it that the prior contributes. The first is at
     /// least the nominal variance, the diagonal element of C.
     pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {

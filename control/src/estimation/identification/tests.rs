@@ -14,8 +14,6 @@ pub(super) struct Simulated {
     heading_rad: f64,
     acceleration_m_s2: [f64; 2],
     pub(super) is_specific_force: bool,
-    /// Factor of all turns.
-    pub(super) turn_ratio: f64,
     time_s: f64,
 }
 
@@ -31,21 +29,20 @@ impl Simulated {
             heading_rad: 0.0,
             acceleration_m_s2: [0.0; 2],
             is_specific_force: false,
-            turn_ratio: 1.0,
             time_s: 0.0,
         }
     }
 
     /// Wheel speeds that accelerate, and turn to both sides.
-    fn wheels_rad_s(&self, time_s: f64) -> [f64; 2] {
+    fn wheels_rad_s(time_s: f64) -> [f64; 2] {
         let mean = 7.0 * (time_s / 2.0).min(1.0) + 1.5 * (0.9 * time_s).sin();
-        let half = self.turn_ratio * (2.0 * (0.5 * time_s).sin() + 0.8 * (2.3 * time_s).sin());
+        let half = 2.0 * (0.5 * time_s).sin() + 0.8 * (2.3 * time_s).sin();
         [mean - half, mean + half]
     }
 
     pub(super) fn sample(&mut self) -> SensorSample {
         let [before, now, after] =
-            [-0.5, 0.5, 1.5].map(|offset| self.wheels_rad_s(self.time_s + offset * SAMPLE_S));
+            [-0.5, 0.5, 1.5].map(|offset| Self::wheels_rad_s(self.time_s + offset * SAMPLE_S));
         let rise = |side: usize| (after[side] - before[side]) / (2.0 * SAMPLE_S);
         let input = Input {
             wheels_rad_s: now,
