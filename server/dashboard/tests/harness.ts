@@ -7,7 +7,7 @@ import { type Browser, type BrowserContext, type Locator, type Page, chromium } 
 import { afterAll, afterEach, beforeAll, expect, inject } from 'vitest';
 
 /** How long anything may take to come about, milliseconds. */
-const PATIENCE_MS = 25_000;
+export const PATIENCE_MS = 25_000;
 const LOOK_AGAIN_MS = 50;
 /** Screenshots are kept here, to be looked at. */
 const SHOTS = new URL('../shots/', import.meta.url).pathname;

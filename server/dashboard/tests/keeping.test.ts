@@ -2,7 +2,7 @@
 import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
 import type { Mission, Page as ApiPage } from './types';
-import { api, browser, eventually, map, metresAt, select, server, shot, windowOf } from './harness';
+import { PATIENCE_MS, api, browser, eventually, map, metresAt, select, server, shot, windowOf } from './harness';
 
 const { open } = browser();
 
@@ -106,12 +106,16 @@ test('what is selected while a slow server answers a reload is selected after it
     await route.continue();
   });
   const isBack = page.waitForEvent('domcontentloaded');
-  // In the page itself, since Playwright waits for the reload before it clicks.
-  await page.evaluate(async () => {
+  // In the page itself, since Playwright does nothing more in it before the reload is over.
+  await page.evaluate(async (patienceMs) => {
     location.reload();
     document.querySelector<HTMLElement>('button[data-robot="rover-3"]')?.click();
-    while (!location.hash.includes('robot=rover-3')) await new Promise((resolve) => setTimeout(resolve, 10));
-  });
+    const end = performance.now() + patienceMs;
+    while (!location.hash.includes('robot=rover-3')) {
+      if (performance.now() > end) throw new Error(`no robot in ${location.hash}`);
+      await new Promise(requestAnimationFrame);
+    }
+  }, PATIENCE_MS);
   answer();
   await isBack;
   await page.getByRole('heading', { name: 'rover-3' }).waitFor();
