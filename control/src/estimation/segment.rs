@@ -76,8 +76,8 @@ pub(super) struct StatedInformation {
     information: f64,
     /// True variance of θ fused from these segments, V ≤ 1/W.
     variance: f64,
-    /// Standard deviation of the tyres' part of its error.
-    tyres: f64,
+    /// Standard deviation of the tyres' part of the error of that θ.
+    tyre_std_dev: f64,
 }
 
 impl StatedInformation {
@@ -113,10 +113,10 @@ impl StatedInformation {
         let [own, tyres] = [found.own_ratio, found.tyres_ratio].map(|ratio| ratio * found.theta);
         let information = self.add(SegmentVariance {
             total: own.powi(2) + tyres.powi(2),
-            shared: self.tyres * tyres,
+            shared: self.tyre_std_dev * tyres,
         });
         if self.information > 0.0 {
-            self.tyres += information / self.information * (tyres - self.tyres);
+            self.tyre_std_dev += information / self.information * (tyres - self.tyre_std_dev);
         }
         SegmentTheta {
             theta: found.theta,
