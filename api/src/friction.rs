@@ -45,7 +45,7 @@ pub struct ThetaErrors {
     /// its mass, yaw inertia and torque constants.
     pub robot_ratio: f64,
     /// Standard deviation, as a ratio of θ, of the error that all robots with the same tyres share:
-    /// from the nonlinearity of the tyres' force over slip.
+    /// from their friction curve, and from slip that does not follow the model.
     pub tyre_ratio: f64,
 }
 

@@ -85,6 +85,13 @@ with tempfile.TemporaryDirectory() as name:
             f"with noise on the wheel speeds θ is {theta}, and the interval is {verdict['theta']}",
         )
     expect(any(verdict["theta"] for verdict in noisy["passes"]), "with a little noise no pass gives an estimate")
+    soft = read(folder / "soft.mcap", *model)
+    for verdict in [*soft["passes"], soft["overall"]]:
+        expect(verdict["theta"] is not None, f"on soft ground there is no estimate: {verdict['abstains']}")
+        expect(
+            holds(truth["soft_theta"], verdict),
+            f"on soft ground θ is {truth['soft_theta']}, and the interval is {verdict['theta']}",
+        )
     named = read(
         folder / "two.mcap", *model, "--imu", "/imu/data",
         "--joints", "front_left_wheel,rear_left_wheel/front_right_wheel,rear_right_wheel",
@@ -119,5 +126,6 @@ with tempfile.TemporaryDirectory() as name:
     print(json.dumps({
         "theta": theta, "interval": interval(good["overall"]), "passes": [interval(one) for one in good["passes"]],
         "effective_track": round(track["ratio"], 4), "at_5_hz": said,
+        "on_soft_ground": [interval(verdict) for verdict in [*soft["passes"], soft["overall"]]],
         "with_noise": [verdict["theta"] and interval(verdict) for verdict in [*noisy["passes"], noisy["overall"]]],
     }))

@@ -4,22 +4,26 @@
 
 The robot is simulated by the few lines below: a rigid body on four contacts, each with a deflection
 that follows slip within a relaxation length, and a force that saturates, `μ = μ_p tanh(K λ / μ_p)`,
-so that K is the slope at zero slip. Accelerations shift the load. Nothing of it is shared with Tread.
+so that K is the slope at zero slip. A resistance of the ground acts on each contact. Accelerations shift the load.
+Nothing of it is shared with Tread.
 It drives figure-8s at changing speed, in two drives with a pause between them.
 
     good.mcap   wheels 50 Hz, inertial unit 100 Hz, pose 10 Hz, written by `mcap` with mcap-ros2-support
     good/       the same messages as rosbag2 with SQLite, written by `rosbags`
     slow.mcap   wheels 5 Hz, the rest as in good.mcap
     noisy.mcap  as good.mcap, with white noise on the wheel speeds, as a filter or an analogue sensor has it
+    soft.mcap   softer ground, on which the friction curve bends from the beginning, `μ = K λ / (1 + K λ / μ_p)`
     torn.mcap   good.mcap, cut off in the middle
     two.mcap    good.mcap with a second inertial unit
 
-Prints one JSON object: the robot's measures, θ = 1/K.
+Prints one JSON object: the robot's measures, θ = 1/K, and that of the softer ground.
 """
 
+import dataclasses
 import json
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,11 +34,8 @@ from rosbags.typesys import Stores, get_typestore
 
 ROBOT = {"mass_kg": 50.0, "track_m": 0.57, "wheelbase_m": 0.51, "wheel_radius_m": 0.165, "yaw_inertia_kg_m2": 5.0}
 STIFFNESS = 4.0
-MU_PEAK = 0.8
+SOFT_STIFFNESS = 0.7
 GRAVITY_M_S2 = 9.80665
-ROLLING_RESISTANCE = 0.015
-HEIGHT_M = 0.2
-RELAXATION_M = 0.03
 WHEEL_LAG_S = 0.08
 STEP_S = 0.001
 DRIVE_S = 80.0
@@ -58,7 +59,33 @@ def wanted(at_s):
     return speed, 0.5 * math.sin(2.0 * math.pi * within_s / 11.0) * speed / 0.65
 
 
-def simulate(random):
+def saturating(slip, ground):
+    """Friction coefficient over slip: `μ = μ_p tanh(K λ / μ_p)`."""
+    return ground.peak * math.tanh(ground.stiffness * slip / ground.peak) / slip if slip > 1e-9 else ground.stiffness
+
+
+def bending(slip, ground):
+    """Friction coefficient over slip: `μ = K λ / (1 + K λ / μ_p)`."""
+    return ground.stiffness / (1.0 + ground.stiffness * slip / ground.peak)
+
+
+@dataclasses.dataclass(frozen=True)
+class Ground:
+    """Contacts of tyres and ground, and what else of the robot the measures do not tell."""
+
+    stiffness: float = STIFFNESS
+    peak: float = 0.8
+    curve: Callable = saturating
+    relaxation_m: float = 0.03
+    resistance: float = 0.015
+    """Force against the motion over load, at the contacts."""
+    practical_slip: float = 0.0
+    """0 if slip is relative to the rim speed, 1 if it is to the forward speed of the wheel's centre."""
+    height_m: float = 0.2
+    """Height of the centre of mass."""
+
+
+def simulate(random, ground=Ground()):
     """The robot's sensors at 100 Hz: means over the time since the sample before."""
     mass, track, base = ROBOT["mass_kg"], ROBOT["track_m"], ROBOT["wheelbase_m"]
     radius, inertia = ROBOT["wheel_radius_m"], ROBOT["yaw_inertia_kg_m2"]
@@ -78,15 +105,16 @@ def simulate(random):
         for number, (at_x, at_y, side) in enumerate(contacts):
             rim, own = wheels[side] * radius, bent[number]
             sliding = rim - (forward - turn * at_y), -(left + turn * at_x)
+            reference = abs(rim) + ground.practical_slip * (abs(forward - turn * at_y) - abs(rim))
             for axis in (0, 1):
-                own[axis] += (sliding[axis] - abs(rim) * own[axis]) * STEP_S / RELAXATION_M
+                own[axis] += (sliding[axis] - reference * own[axis]) * STEP_S / ground.relaxation_m
                 # A standing wheel deflects no further than its contact holds.
                 own[axis] = max(-1.0, min(1.0, own[axis]))
             slip = math.hypot(*own)
-            shift = HEIGHT_M * (push_x * math.copysign(1, at_x) / base + push_y * math.copysign(1, at_y) / track) / 2.0
+            shift = ground.height_m * (push_x * math.copysign(1, at_x) / base + push_y * math.copysign(1, at_y) / track) / 2.0
             weight = load - mass * shift
-            stiffness = MU_PEAK * math.tanh(STIFFNESS * slip / MU_PEAK) / slip if slip > 1e-9 else STIFFNESS
-            along = weight * (stiffness * own[0] - ROLLING_RESISTANCE * math.tanh(rim / 0.01))
+            stiffness = ground.curve(slip, ground)
+            along = weight * (stiffness * own[0] - ground.resistance * math.tanh(rim / 0.01))
             across = weight * stiffness * own[1]
             # A contact at rest is damped by its rubber.
             if abs(rim) < 0.1:
@@ -189,15 +217,22 @@ def write_bag(path, messages):
             writer.write(connections[topic], BEGIN_NS + at_ns, store.serialize_cdr(message, kind))
 
 
-folder = Path(sys.argv[1])
-samples = simulate(np.random.default_rng(7))
-good = list(messages(samples, 50, np.random.default_rng(8)))
-write_mcap(folder / "good.mcap", good)
-write_bag(folder / "good", good)
-write_mcap(folder / "slow.mcap", messages(samples, 5, np.random.default_rng(9)))
-write_mcap(folder / "noisy.mcap", messages(samples, 50, np.random.default_rng(10), WHEEL_NOISE_RAD_S))
-whole = (folder / "good.mcap").read_bytes()
-(folder / "torn.mcap").write_bytes(whole[: len(whole) // 2])
-second = [("/imu/other", message, at_ns) for topic, message, at_ns in good if topic == "/imu/data"]
-write_mcap(folder / "two.mcap", sorted(good + second, key=lambda entry: entry[2]))
-print(json.dumps({"robot": ROBOT, "theta": 1.0 / STIFFNESS}))
+def main():
+    folder = Path(sys.argv[1])
+    samples = simulate(np.random.default_rng(7))
+    good = list(messages(samples, 50, np.random.default_rng(8)))
+    write_mcap(folder / "good.mcap", good)
+    write_bag(folder / "good", good)
+    write_mcap(folder / "slow.mcap", messages(samples, 5, np.random.default_rng(9)))
+    write_mcap(folder / "noisy.mcap", messages(samples, 50, np.random.default_rng(10), WHEEL_NOISE_RAD_S))
+    soft = simulate(np.random.default_rng(11), Ground(SOFT_STIFFNESS, curve=bending))
+    write_mcap(folder / "soft.mcap", messages(soft, 50, np.random.default_rng(12)))
+    whole = (folder / "good.mcap").read_bytes()
+    (folder / "torn.mcap").write_bytes(whole[: len(whole) // 2])
+    second = [("/imu/other", message, at_ns) for topic, message, at_ns in good if topic == "/imu/data"]
+    write_mcap(folder / "two.mcap", sorted(good + second, key=lambda entry: entry[2]))
+    print(json.dumps({"robot": ROBOT, "theta": 1.0 / STIFFNESS, "soft_theta": 1.0 / SOFT_STIFFNESS}))
+
+
+if __name__ == "__main__":
+    main()

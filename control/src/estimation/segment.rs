@@ -219,6 +219,7 @@ mod tests {
                     own_ratio,
                     robot_ratio: 0.1,
                     tyres_ratio,
+                    tyre_prior_ratio: 0.0,
                     duration_s: 10.0,
                 });
                 information += found.information;

@@ -64,8 +64,8 @@ pub struct TyrePrior {
     /// Largest friction coefficient at which this curve is valid, below the smallest possible peak;
     /// `None` if only slip limits it.
     pub mu_max: Option<f64>,
-    /// Mean of the contacts' relaxation length, metres: the rolling distance in which force follows
-    /// slip.
+    /// Mean of the contacts' relaxation length at zero slip, metres: the rolling distance in which
+    /// force follows slip.
     #[serde(default)]
     pub relaxation_m: f64,
     /// Standard deviation of the relaxation length, metres.
@@ -244,7 +244,8 @@ pub struct CommonError {
     /// Error common to all measurements of one robot: mass, yaw inertia, torque constants, and in a
     /// segment the remaining uncertainty of radii and sensor offsets.
     pub robot: f64,
-    /// Error by the tyres' curvature, common to all robots with the same tyres at similar slip.
+    /// Error from the friction curve of the tyres and from slip that does not follow the model,
+    /// common to all robots with the same tyres at similar slip.
     pub tyres: f64,
 }
 

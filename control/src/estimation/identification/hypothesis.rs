@@ -10,7 +10,8 @@
 //! exp(−3 Δ² / (R² + σ²/2))      R = LINEAR_RANGE, σ² = variance of ln K before the step
 //! ```
 //!
-//! R is the range in which the expansion is accurate. σ is added because the true ln K is expected
+//! R is the range in which the expansion is accurate; it is larger where noise of the wheel speeds is
+//! subtracted, to which most steps are then due. σ is added because the true ln K is expected
 //! at the squared distance `σ² + Δ²` from `p_b`, and at σ² from the new value. As long as Δ is
 //! below σ, the old expansion is nearly as close to the truth as a new one, and its information is
 //! worth keeping. With R alone an estimate with little information, as on tyres that slide most of
@@ -19,17 +20,17 @@
 //!
 //! With `C = (Σ Jᵀ W J + prior information)⁻¹` the covariance is the
 //! robust one, `C (Σ g gᵀ + prior information) C`: the empirical scatter of the blocks' scores
-//! `g = Jᵀ W r` replaces the assumption of white residuals and a true model.
+//! `g = Jᵀ W r` replaces the assumption of white residuals and a true model. The residuals of a score
+//! are those at the solution with its block.
 
 use super::fast_changes::FastChanges;
 use super::model::{CHANNELS, Input, State};
 use super::parameters::{Number, Prior, Robot, Values, index};
 use super::scale::{ChannelResidual, Residual, TimeScale, ln_stiffness_gradient};
-use super::simulation::{Predicted, Simulation, delays_s};
+use super::scales::TimeScales;
+use super::simulation::{ChannelOutput, Predicted, Simulation, delays_s};
 use crate::robot::RobotModel;
 
-/// Numbers of comparisons in the means of the time scales: 0.05, 0.2 and 0.5 s.
-const SCALES: [u32; 3] = [1, 4, 10];
 /// Channels of the accelerations.
 const ACCELERATIONS: std::ops::RangeInclusive<usize> = 1..=2;
 /// R, the change of a precisely known ln K that multiplies the weights of older blocks by e⁻³.
@@ -38,26 +39,34 @@ const LINEAR_RANGE: f64 = 0.1;
 /// later ones are due to noise of the wheel speeds.
 const SETTLING_BLOCKS: u32 = 6;
 /// Fraction of the variance σ² that is added to R². With all of it, first expansions would be kept
-/// that took noise of the wheel speeds for slip.
+/// that took noise of the wheel speeds for slip, before it is known and subtracted.
 const VARIANCE_SHARE: f64 = 0.5;
+/// R and that fraction where noise of the wheel speeds is subtracted. Steps of ln K are then due to
+/// noise for the most part, and say little about the accuracy of earlier expansions.
+const NOISY_LINEAR_RANGE: f64 = 0.3;
+const NOISY_VARIANCE_SHARE: f64 = 1.0;
 /// Factors of the blocks' weights below which the variance of ln K is computed again, and the
 /// number of blocks in which the first one applies. Later expansions are close to each other, so
 /// that the variance hardly changes and can wait for the next block; the first ones can be far
 /// apart.
 const REFRESH_BELOW_EARLY: f64 = 0.9;
 const REFRESH_BELOW: f64 = 0.01;
+/// Number of blocks in which an estimate converges from its starting value, so that residuals and steps
+/// can be large.
 const CONVERGES_BLOCKS: u32 = 15;
 /// Factor of the last step on the weights of the blocks, from which the former weights can be
 /// restored.
 const RESTORE_ABOVE: f64 = 1.0e-3;
 /// Maximum magnitude of the change of ln K at the end of one block.
 const STEP_MAX: f64 = 0.4;
+/// Minimum of that maximum once the estimate has converged.
+const CONVERGED_STEP_MIN: f64 = 0.03;
 /// Maximum squared standardised residual in the cost.
 const COST_MAX: f64 = 25.0;
 /// Factor by which each later block multiplies the cost so far.
 const COST_DECAY: f64 = 0.95;
 
-/// Estimate of ln K from one segment, and the two parts of its variance.
+/// Estimate of ln K from one segment, and the parts of its variance.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SegmentEstimate {
     /// Estimate of ln K.
@@ -66,22 +75,11 @@ pub(super) struct SegmentEstimate {
     /// segments.
     pub(super) own: f64,
     /// Variance of ln K from the uncertainty of all other parameters, which come from the ground's
-    /// other blocks and the prior; common to the segments of a robot.
-    pub(super) known: f64,
-}
-
-/// Output of one channel, and that of the model with noise added to the wheel speeds.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct ChannelOutput {
-    output: Predicted,
-    perturbed: Option<Predicted>,
-}
-
-impl ChannelOutput {
-    /// Returns the output without slopes.
-    pub(super) fn value(&self) -> f64 {
-        self.output.value
-    }
+    /// other blocks and the prior, without that from the tyres' prior; common to the segments of a
+    /// robot.
+    pub(super) of_robot: f64,
+    /// Variance of ln K from the prior of the tyres.
+    pub(super) of_tyres: f64,
 }
 
 /// A measurement of one channel.
@@ -107,9 +105,7 @@ pub(super) struct Hypothesis {
     model: Simulation<Number>,
     /// The same with noise added to the wheel speeds; None if they have none.
     perturbed: Option<Simulation<Number>>,
-    /// The normal equations at each time scale, and the one that is used.
-    scales: [TimeScale; SCALES.len()],
-    used: usize,
+    scales: TimeScales,
     /// Fast changes of the accelerations: measured, in the output, and by the added noise.
     fast: FastChanges,
     cost: f64,
@@ -119,9 +115,6 @@ pub(super) struct Hypothesis {
     variance_before_step: f64,
     /// Number of complete blocks.
     age: u32,
-    /// Whether the last normal equations could be solved at any time scale; otherwise noise of the
-    /// wheel speeds dominates the measurements.
-    is_determined: bool,
 }
 
 impl Hypothesis {
@@ -134,10 +127,8 @@ impl Hypothesis {
             robot: None,
             model: Simulation::new(state.constants()),
             perturbed: None,
-            scales: SCALES.map(TimeScale::new),
-            used: 0,
+            scales: TimeScales::new(),
             fast: FastChanges::new(),
-            is_determined: true,
             cost: 0.0,
             last_weight_factor: 1.0,
             variance_before_step: f64::INFINITY,
@@ -160,17 +151,18 @@ impl Hypothesis {
     /// Returns the factor, at least 1, by which a channel's residuals exceed their standard
     /// deviation.
     pub(super) fn residual_ratio(&self, channel: usize) -> f64 {
-        self.scales[0].residual_ratio(channel)
+        self.scales.residual_ratio(channel)
     }
 
     /// Drops the measurements of the open block.
     pub(super) fn drop_block(&mut self) {
         self.fast.drop_block();
-        self.scales.iter_mut().for_each(TimeScale::drop_block);
+        self.scales.drop_block();
     }
 
-    fn scale(&self) -> &TimeScale {
-        &self.scales[self.used]
+    /// Returns the normal equations at the time scale that is used.
+    pub(super) fn scale(&self) -> &TimeScale {
+        self.scales.used()
     }
 
     fn set_values(&mut self, values: Values) {
@@ -290,15 +282,13 @@ impl Hypothesis {
             std_dev,
             square_min: measured.square_min,
         };
-        for scale in &mut self.scales {
-            scale.add(channel, &compared);
-        }
+        self.scales.add(channel, &compared);
         self.cost += square.min(COST_MAX);
     }
 
     /// Ends a comparison of the means since the last call.
     pub(super) fn end_comparison(&mut self) {
-        self.scales.iter_mut().for_each(TimeScale::end_comparison);
+        self.scales.end_comparison();
     }
 
     /// Ends the open block and takes a bounded Gauss–Newton step from all blocks of the ground and
@@ -307,12 +297,10 @@ impl Hypothesis {
         let values = self.values;
         self.last_weight_factor = 1.0;
         self.fast.end_block();
-        self.scales
-            .iter_mut()
-            .for_each(|scale| scale.end_block(&values));
         self.age = self.age.saturating_add(1);
         self.cost *= COST_DECAY;
-        let Some(solution) = self.solve(prior) else {
+        let has_converged = self.age > CONVERGES_BLOCKS;
+        let Some(solution) = self.scales.end_block(&values, prior, has_converged) else {
             // The same values are used until the equations can be solved.
             return true;
         };
@@ -321,7 +309,7 @@ impl Hypothesis {
             .zip_map(&prior.std_devs, |step, std_dev| step.abs() / std_dev)
             .max();
         step /= largest
-            .max(step[index::STIFFNESS].abs() / STEP_MAX)
+            .max(step[index::STIFFNESS].abs() / self.step_max())
             .max(1.0);
         let before = self.values;
         self.set_values(prior.in_range(before + step));
@@ -329,19 +317,22 @@ impl Hypothesis {
         for own in std::iter::once(&mut self.model).chain(&mut self.perturbed) {
             own.shift(&step);
         }
-        let range_square = LINEAR_RANGE.powi(2) + VARIANCE_SHARE * self.scale().nominal_variance();
+        let (range, share) = if self.perturbed.is_some() {
+            (NOISY_LINEAR_RANGE, NOISY_VARIANCE_SHARE)
+        } else {
+            (LINEAR_RANGE, VARIANCE_SHARE)
+        };
+        let range_square = range.powi(2) + share * self.scale().nominal_variance();
         let weight_factor = (-3.0 * step[index::STIFFNESS].powi(2) / range_square).exp();
         self.variance_before_step = self.variances(prior).0;
-        for scale in &mut self.scales {
-            scale.scale_weights(weight_factor);
-        }
+        self.scales.scale_weights(weight_factor);
         let limit = if self.age <= CONVERGES_BLOCKS {
             REFRESH_BELOW_EARLY
         } else {
             REFRESH_BELOW
         };
         if weight_factor < limit {
-            self.scales[self.used].update_variances(prior);
+            self.scales.update_variances(prior);
         }
         self.last_weight_factor = weight_factor;
         if self.age <= SETTLING_BLOCKS && step[index::STIFFNESS].abs() > LINEAR_RANGE {
@@ -350,28 +341,20 @@ impl Hypothesis {
         self.values.iter().all(|value| value.is_finite())
     }
 
-    /// Solves the normal equations of all time scales and chooses the shortest one that agrees with
-    /// the next longer one, or for which that one has no solution. Returns its solution.
-    fn solve(&mut self, prior: &Prior) -> Option<Values> {
-        let mut solutions = [None; SCALES.len()];
-        for (scale, solution) in self.scales.iter_mut().zip(&mut solutions) {
-            *solution = scale.solve(prior);
+    /// Returns the maximum magnitude of the change of ln K at the end of a block. Once the estimate
+    /// has converged that is its nominal standard deviation: a larger change is due to outliers, or to a change of the
+    /// ground that was not detected, which takes more blocks to follow.
+    fn step_max(&self) -> f64 {
+        if self.age <= CONVERGES_BLOCKS {
+            return STEP_MAX;
         }
-        let is_trusted = |place: usize| {
-            let next = place + 1;
-            let is_last = next == SCALES.len();
-            let agrees = || self.scales[place].agrees_with(&self.scales[next], prior);
-            solutions[place].is_some() && (is_last || solutions[next].is_none() || agrees())
-        };
-        let trusted = (0..SCALES.len()).find(|&place| is_trusted(place));
-        self.is_determined = trusted.is_some();
-        self.used = trusted.unwrap_or(SCALES.len() - 1);
-        solutions[self.used]
+        let std_dev = self.scale().nominal_variance().sqrt();
+        std_dev.clamp(CONVERGED_STEP_MIN, STEP_MAX)
     }
 
     /// Returns whether the last normal equations could be solved at any time scale.
     pub(super) fn is_determined(&self) -> bool {
-        self.is_determined
+        self.scales.is_determined()
     }
 
     /// Returns whether most of the output's fast changes are noise of the wheel speeds, which the
@@ -384,12 +367,6 @@ impl Hypothesis {
     /// least the nominal variance, the diagonal element of C.
     pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {
         self.scale().variances(prior)
-    }
-
-    /// Returns the variance by which the interval of ln K is inflated because the prior of the
-    /// friction curve's bend is too narrow.
-    pub(super) fn bend_variance_inflation(&self, prior: &Prior) -> f64 {
-        self.scale().bend_variance_inflation(prior)
     }
 
     /// Returns the variance of ln K before the step at the end of the last block, infinite before
@@ -411,7 +388,7 @@ impl Hypothesis {
         let few = 1.0 + 2.0 / ground.count.max(1.0);
         Some(slopes.map(|slopes| {
             let covariances = cholesky.solve(&slopes);
-            let scattered = few * (ground.scores * covariances).dot(&covariances);
+            let scattered = few * (self.scale().scores * covariances).dot(&covariances);
             let known = (prior.information * covariances).dot(&covariances);
             (scattered + known).max(covariances.dot(&slopes))
         }))
@@ -421,16 +398,14 @@ impl Hypothesis {
     /// the parameters from the other blocks with their former weights, because those after the last
     /// block may be of the next ground.
     pub(super) fn drop_last_block(&mut self, prior: &Prior) {
-        self.scales.iter_mut().for_each(TimeScale::drop_last_block);
+        self.scales.drop_last_block();
         self.drop_block();
         if self.last_weight_factor >= RESTORE_ABOVE {
             let restored = self.last_weight_factor.recip();
-            self.scales
-                .iter_mut()
-                .for_each(|scale| scale.scale_weights(restored));
+            self.scales.scale_weights(restored);
             self.last_weight_factor = 1.0;
         }
-        if let Some(values) = self.solve(prior) {
+        if let Some(values) = self.scales.solve(prior) {
             self.set_values(prior.in_range(values));
         }
     }
@@ -441,8 +416,8 @@ impl Hypothesis {
     /// marginalised from them. So K may differ between segments, and the segments' own errors are
     /// independent. None if the segment has no blocks, or its normal equations cannot be solved.
     pub(super) fn close_segment(&mut self, prior: &Prior) -> Option<SegmentEstimate> {
-        let segments = self.scales.each_mut().map(TimeScale::take_segment);
-        let (segment, scale) = (&segments[self.used], self.scale());
+        let segment = self.scales.take_segment();
+        let scale = self.scale();
         let ground = &scale.ground;
         if segment.count <= 0.0 {
             return None;
@@ -457,6 +432,7 @@ impl Hypothesis {
         others.ger(-most.recip(), &of_stiffness, &of_stiffness, 1.0);
         let cholesky = (others + segment.information).cholesky()?;
         let values = cholesky.solve(&(information_vector + segment.preferred));
+        let values = prior.limited(values, |gradient| cholesky.solve(gradient));
         let of_stiffness = cholesky.solve(&ln_stiffness_gradient());
         // The segment has too few blocks for a scatter of its own: that of the whole ground is
         // used.
@@ -464,12 +440,15 @@ impl Hypothesis {
             (ground.information * scale.stiffness_covariance).dot(&scale.stiffness_covariance);
         let scatter = (scale.scattered() / whole).max(1.0);
         let own = scatter * (segment.information * of_stiffness).dot(&of_stiffness);
+        let known = (others * of_stiffness).dot(&of_stiffness);
+        let of_tyres = prior.tyre_variance(&of_stiffness);
         let found = SegmentEstimate {
             ln_stiffness: values[index::STIFFNESS],
             own,
-            known: (others * of_stiffness).dot(&of_stiffness).max(0.0),
+            of_robot: (known - of_tyres).max(0.0),
+            of_tyres,
         };
-        let is_known = found.ln_stiffness.is_finite() && found.known.is_finite() && own > 0.0;
+        let is_known = found.ln_stiffness.is_finite() && known.is_finite() && own > 0.0;
         (is_known && own.is_finite()).then_some(found)
     }
 

@@ -4,7 +4,7 @@
 //! The rows of the other modules are linear in θ for small slip and average over blocks, which is
 //! exact for a robot that equals its model. For other robots they use a small part of the
 //! measurements, and give no estimate beyond small slip. This module simulates the equations of
-//! motion ([`model`]) with the measured wheel speeds as input, and estimates all 25 unknown
+//! motion ([`model`]) with the measured wheel speeds as input, and estimates all 28 unknown
 //! parameters ([`parameters`]) at once from the other sensors ([`hypothesis`]). The problem is
 //! nonlinear, so three estimators start at different values of K; those that fit worse are
 //! discarded.
@@ -16,10 +16,13 @@ mod hypothesis;
 #[cfg(test)]
 mod inertial_tests;
 mod model;
+#[cfg(test)]
+mod outlier_tests;
 mod parameters;
 mod recent;
 mod robot;
 mod scale;
+mod scales;
 mod segment;
 mod simulation;
 #[cfg(test)]
@@ -77,8 +80,8 @@ const MODEL_TORQUE_MU: f64 = 0.025;
 /// the model's equations: a relative one, of ln θ, and an absolute one, of θ, which is a slip per
 /// friction coefficient and dominates where θ is small: without and with measured torque, which
 /// shows some of what the equations miss.
-const MODEL_LN_THETA_STD_DEV: f64 = 0.05;
-const MODEL_THETA_STD_DEVS: [f64; 2] = [0.014, 0.010];
+const MODEL_LN_THETA_STD_DEV: f64 = 0.045;
+const MODEL_THETA_STD_DEVS: [f64; 2] = [0.010, 0.008];
 /// Minimum duration of the block with which a segment ends, seconds; a shorter one is not used.
 const SHORT_BLOCK_S: f64 = 0.5;
 /// Minimum of the mean square of a channel's standardised residuals in its weights, without and
@@ -98,9 +101,12 @@ pub(super) struct Identified {
     pub(super) own_ratio: f64,
     /// Part from the prior of the robot's other parameters; common to all estimates of the robot.
     pub(super) robot_ratio: f64,
-    /// Part from tyres and ground that do not follow the model's equations, and from a bend of the
-    /// friction curve outside its prior; common to all robots with these tyres.
+    /// Part from the prior of the tyres, from a bend of the friction curve outside its prior, and
+    /// from tyres and ground that do not follow the model's equations; common to all robots with
+    /// these tyres.
     pub(super) tyres_ratio: f64,
+    /// Part of `tyres_ratio` from the prior of the tyres alone.
+    pub(super) tyre_prior_ratio: f64,
     /// Duration of the measurements in the estimate, seconds.
     pub(super) duration_s: f64,
 }
@@ -587,7 +593,8 @@ impl Identification {
         }
         let least = self.least_cost();
         let cost_scale = COST_SCALE * self.residual_square();
-        let (mut weights, mut mean, mut square, mut known, mut bend) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        let (mut weights, mut mean, mut square) = (0.0, 0.0, 0.0);
+        let (mut known, mut tyres, mut bend) = (0.0, 0.0, 0.0);
         for hypothesis in &self.hypotheses {
             let weight = (-(hypothesis.cost() - least) / cost_scale).exp();
             let value = hypothesis.values()[index::STIFFNESS];
@@ -596,20 +603,24 @@ impl Identification {
             mean += weight * value;
             square += weight * (variance + value * value);
             known += weight * of_prior;
-            bend += weight * hypothesis.bend_variance_inflation(&self.prior);
+            tyres += weight * hypothesis.scale().tyre_variance(&self.prior);
+            bend += weight * hypothesis.scale().bend_variance_inflation(&self.prior);
         }
         mean /= weights;
         let variance = square / weights - mean * mean;
         let of_prior = (known / weights).min(variance);
+        let of_tyres = (tyres / weights).min(of_prior);
         let is_known = mean.is_finite() && variance.is_finite() && variance > 0.0;
         let theta = (-mean).exp();
         let absolute = MODEL_THETA_STD_DEVS[usize::from(self.has_torque)] / theta;
-        let tyres = MODEL_LN_THETA_STD_DEV.powi(2) + absolute.powi(2) + bend / weights;
+        let of_model = MODEL_LN_THETA_STD_DEV.powi(2) + absolute.powi(2);
+        let of_model = of_model + bend / weights;
         is_known.then(|| Identified {
             theta,
             own_ratio: (variance - of_prior).max(0.0).sqrt(),
-            robot_ratio: of_prior.max(0.0).sqrt(),
-            tyres_ratio: tyres.sqrt(),
+            robot_ratio: (of_prior - of_tyres).max(0.0).sqrt(),
+            tyres_ratio: (of_model + of_tyres).sqrt(),
+            tyre_prior_ratio: of_tyres.max(0.0).sqrt(),
             duration_s: f64::from(best.age()) * BLOCK_S,
         })
     }

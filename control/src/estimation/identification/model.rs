@@ -2,13 +2,23 @@
 //! speeds.
 //!
 //! State at the centre of mass, body frame: forward and left speed, turn rate; per contact a
-//! deflection s as a slip vector with `ℓ ṡ = v_slip − |u| s` (relaxation length ℓ, rim speed u:
-//! Pacejka, Tire and Vehicle Dynamics, ch. 7). A contact with the load N has the force `N K s / D`,
+//! deflection s as a slip vector with `ℓ ṡ = (1 + q x) (v_slip − V s)` (relaxation length ℓ at zero
+//! slip: Pacejka, Tire and Vehicle Dynamics, ch. 7). With q = 0 the relaxation length is constant,
+//! with q = 1 it decreases like that of a lumped `LuGre` contact; a contact that deflects
+//! like a spring is between them. `V = |u| + p (|v| − |u|)` lies between the rim speed u and the forward
+//! speed v of the wheel's centre: with p = 0 the steady s is the theoretical slip of brush models
+//! and of Yi et al. (2007), with p = 1 the practical slip over which the Magic Formula is fitted
+//! (Pacejka, ch. 3 and 4). A contact with the load N has the force `N K s / D`,
 //! with `D = (1 + n a x + xⁿ)^(1/n)` and `x = K|s|/μ_p`: its slope is K = 1/θ at zero slip, and its
 //! friction coefficient approaches `μ_p` at large slip. a = 0 with a large n is the straight rise
 //! of Yi et al. (2007), eq. (7), up to the peak; a = 1/3 with n = 3 is within 4 % of a brush model;
 //! a = 0 with n = 2.7 of a Magic Formula; a = 2/3 with n = 2 of a `LuGre` tyre. N follows from the
 //! position of the centre of mass, the slope, and measured accelerations.
+//!
+//! Two resistances are proportional to N. Rolling resistance is a torque that is lost in the tyre:
+//! it has to be driven, and does not act on the body. Motion resistance is a force of the ground against the
+//! motion, as of soft ground that is compacted (Wong, Theory of Ground Vehicles, ch. 2): the
+//! contacts have to slip for it even where the robot drives straight at a constant speed.
 
 use super::dual::Real;
 use super::parameters::Robot;
@@ -27,9 +37,12 @@ const SLOW_M_S: f64 = 0.1;
 const DAMPING_RATIO: f64 = 0.2;
 /// Maximum deflection of a slow contact, relative to `μ_p/K`.
 const STANDING_DEFLECTION_MAX: f64 = 5.0;
-/// Rim speed over which rolling resistance and gear loss smoothly change their sign (`tanh`),
+/// Rim speed over which resistances and gear loss smoothly change their sign (`tanh`),
 /// metres per second.
 const RESISTANCE_SIGN_WIDTH_M_S: f64 = 0.01;
+/// Minimum of the speed that slip is relative to, over the rim speed: practical slip has no bound
+/// where wheels turn and the robot stands.
+const REFERENCE_MIN_RATIO: f64 = 0.05;
 /// Added to the square of slip, so that the root has a finite slope at zero.
 const SLIP_SQUARE_MIN: f64 = 1.0e-10;
 // Arrays of numbers are written out below: `map` copies them, and a copy of numbers with their
@@ -135,6 +148,17 @@ struct Forces<T> {
     sides_n: [T; 2],
 }
 
+/// Returns the magnitude of a deflection as slip, above 0.
+fn magnitude<T: Real>([forward, left]: [T; 2]) -> T {
+    (forward * forward + left * left + SLIP_SQUARE_MIN).sqrt()
+}
+
+/// Returns 1 for a wheel that rolls forward, -1 for one that rolls backward, and a value between near
+/// standstill.
+fn direction<T: Real>(rim_m_s: T) -> f64 {
+    (rim_m_s.value() / RESISTANCE_SIGN_WIDTH_M_S).tanh()
+}
+
 /// Returns the acceleration by gravity along sloped ground in the body frame, forward and left,
 /// metres per second squared. The slope is the rise per distance along the x and y axes of a frame
 /// on the ground, in which the body has the heading `heading_rad`, counter-clockwise from x.
@@ -180,7 +204,7 @@ impl<T: Real> Robot<T> {
 
     /// Returns the friction coefficient over slip, `K / D`, at a slip above 0.
     fn mu_over_slip(&self, slip: T) -> T {
-        let x = self.stiffness / self.peak * slip;
+        let x = self.per_peak_slip * slip;
         let inside = (x.ln() * self.sharpness).exp() + self.sharpness * self.bend * x + 1.0;
         self.stiffness / (inside.ln() / self.sharpness).exp()
     }
@@ -190,7 +214,7 @@ impl<T: Real> Robot<T> {
         &self,
         state: &mut State<T>,
         contacts: &[Contact<T>; 4],
-        speeds_m_s: [T; 2],
+        (speeds_m_s, directions): ([T; 2], [f64; 2]),
         step_s: f64,
     ) -> Forces<T> {
         let zero = T::constant(0.0);
@@ -205,18 +229,24 @@ impl<T: Real> Robot<T> {
         for (contact, deflection) in contacts.iter().zip(&mut state.deflections) {
             let [x_m, y_m] = contact.place_m;
             let rim_m_s = speeds_m_s[contact.side];
-            let slips_m_s = [
-                rim_m_s - (forward_m_s - turn * y_m),
-                -(left_m_s + turn * x_m),
-            ];
+            let centre_m_s = forward_m_s - turn * y_m;
+            let slips_m_s = [rim_m_s - centre_m_s, -(left_m_s + turn * x_m)];
+            let theoretical_m_s = rim_m_s.abs();
+            let mut reference_m_s =
+                theoretical_m_s + self.practical_slip * (centre_m_s.abs() - theoretical_m_s);
+            if reference_m_s.value() < REFERENCE_MIN_RATIO * theoretical_m_s.value() {
+                reference_m_s = theoretical_m_s * REFERENCE_MIN_RATIO;
+            }
+            let x = self.per_peak_slip * magnitude(*deflection);
+            let rate = rate * (self.relaxation_decrease * x + 1.0);
             // Trapezoidal in the deflection, which is stiff at short relaxation lengths.
-            let rolled = rate * rim_m_s.abs() * 0.5;
+            let rolled = rate * reference_m_s * 0.5;
             let (keeps, over) = (-rolled + 1.0, (rolled + 1.0).recip());
             for (part, slip_m_s) in deflection.iter_mut().zip(slips_m_s) {
                 *part = (*part * keeps + rate * slip_m_s) * over;
             }
             let [forward, left] = *deflection;
-            let slip = (forward * forward + left * left + SLIP_SQUARE_MIN).sqrt();
+            let slip = magnitude(*deflection);
             let mu_over_slip = self.mu_over_slip(slip);
             let per_slip_n = mu_over_slip * contact.load_n;
             let mut force_n = [per_slip_n * forward, per_slip_n * left];
@@ -229,7 +259,7 @@ impl<T: Real> Robot<T> {
                     force_n.iter_mut().zip(slips_m_s).zip(*deflection)
                 {
                     *force_n =
-                        *force_n + contact.load_n * damping * (slip_m_s - rim_m_s.abs() * part);
+                        *force_n + contact.load_n * damping * (slip_m_s - reference_m_s * part);
                 }
                 let most = STANDING_DEFLECTION_MAX * self.peak.value() / stiffness;
                 if slip.value() > most {
@@ -238,13 +268,15 @@ impl<T: Real> Robot<T> {
                     *left = *left * (most / slip.value());
                 }
             }
-            let [longitudinal_n, lateral_n] = force_n;
+            let [tractive_n, lateral_n] = force_n;
+            let longitudinal_n =
+                tractive_n - self.motion_resistance * contact.load_n * directions[contact.side];
             sums.force_n = [
                 sums.force_n[0] + longitudinal_n,
                 sums.force_n[1] + lateral_n,
             ];
             sums.moment_n_m = sums.moment_n_m + x_m * lateral_n - y_m * longitudinal_n;
-            sums.sides_n[contact.side] = sums.sides_n[contact.side] + longitudinal_n;
+            sums.sides_n[contact.side] = sums.sides_n[contact.side] + tractive_n;
         }
         sums
     }
@@ -271,7 +303,8 @@ impl<T: Real> Robot<T> {
                     * (input.wheels_rad_s[side] + input.wheels_rad_s2[side] * from_middle_s)
             };
             let rims_m_s = [rim_of(0), rim_of(1)];
-            let forces = self.deflect(state, &contacts, rims_m_s, step_s);
+            let directions = rims_m_s.map(direction);
+            let forces = self.deflect(state, &contacts, (rims_m_s, directions), step_s);
             let [forward_m_s, left_m_s] = state.speed_m_s;
             let turn = state.turn_rad_s;
             let along = |axis: usize| forces.force_n[axis] * per_mass + gravity[axis];
@@ -290,10 +323,9 @@ impl<T: Real> Robot<T> {
                 };
                 output.acceleration_m_s2[side] = output.acceleration_m_s2[side] + measured * share;
                 let load_n = contacts[2 * side].load_n + contacts[2 * side + 1].load_n;
-                let turns = (rims_m_s[side].value() / RESISTANCE_SIGN_WIDTH_M_S).tanh();
                 let side_n = forces.sides_n[side];
-                let driving_n =
-                    side_n + (self.resistance * load_n + self.gear_loss * side_n.abs()) * turns;
+                let lost_n = self.resistance * load_n + self.gear_loss * side_n.abs();
+                let driving_n = side_n + lost_n * directions[side];
                 let nominal_m = self.nominal_radius_m;
                 let rotors_n_m =
                     self.rotors_kg * (nominal_m * nominal_m * input.wheels_rad_s2[side]);

@@ -7,10 +7,10 @@ use crate::estimation::{EstimatorPrior, SensorNoise};
 use crate::robot::RobotModel;
 
 /// Number of parameters.
-pub(super) const PARAMETERS: usize = 25;
+pub(super) const PARAMETERS: usize = 28;
 /// Number of parameters of the equations of motion and of the sensors' scales and offsets: all but
 /// the delays, which are the last ones.
-pub(super) const MODELLED: usize = 23;
+pub(super) const MODELLED: usize = 26;
 /// Values of all parameters.
 pub(super) type Values = SVector<f64, PARAMETERS>;
 /// Covariance or information of all parameters.
@@ -45,7 +45,7 @@ pub(super) mod index {
     pub(in super::super) const ROTORS: usize = 10;
     /// Torque lost in the gears, relative to the transmitted torque.
     pub(in super::super) const GEAR_LOSS: usize = 11;
-    /// Rolling resistance coefficient of the ground.
+    /// Rolling resistance coefficient: torque that is lost in the tyres, over load and wheel radius.
     pub(in super::super) const RESISTANCE: usize = 12;
     /// Relative error of the rolling radius: mean, and difference right minus left.
     pub(in super::super) const RADIUS: usize = 13;
@@ -64,10 +64,18 @@ pub(super) mod index {
     pub(in super::super) const HEIGHT: usize = 21;
     /// Offset of the measured body speed, metres per second.
     pub(in super::super) const SPEED_OFFSET: usize = 22;
+    /// 0 for theoretical slip, which is relative to the rim speed, 1 for practical slip, which is
+    /// relative to the forward speed of the wheel's centre; p of the module `model`.
+    pub(in super::super) const PRACTICAL_SLIP: usize = 23;
+    /// Decrease of the relaxation length with slip, q of the module `model`.
+    pub(in super::super) const RELAXATION_DECREASE: usize = 24;
+    /// Motion resistance coefficient: force of the ground against the wheels' motion, over their
+    /// load.
+    pub(in super::super) const MOTION_RESISTANCE: usize = 25;
     /// Delay of the gyro relative to the wheel speeds, and of the accelerometer relative to the
     /// gyro, seconds.
-    pub(in super::super) const GYRO_DELAY: usize = 23;
-    pub(in super::super) const ACCELEROMETER_DELAY: usize = 24;
+    pub(in super::super) const GYRO_DELAY: usize = 26;
+    pub(in super::super) const ACCELEROMETER_DELAY: usize = 27;
 }
 
 /// Normal prior of the parameters at the start of a ground, in the units of [`index`].
@@ -91,6 +99,14 @@ impl Prior {
         self.information = Square::from_diagonal(&self.std_devs.map(|std_dev| std_dev.powi(-2)));
     }
 
+    /// Returns the variance that the prior of the tyres' parameters [`OF_TYRES`] contributes to a
+    /// parameter with these posterior covariances with all parameters. On each ground they start
+    /// from the initial prior, in which they are independent.
+    pub(super) fn tyre_variance(&self, covariances: &Values) -> f64 {
+        let contributed = |place: usize| (covariances[place] / self.std_devs[place]).powi(2);
+        OF_TYRES.into_iter().map(contributed).sum()
+    }
+
     /// Limits parameters to their ranges.
     pub(super) fn in_range(&self, mut values: Values) -> Values {
         for place in 0..PARAMETERS {
@@ -98,27 +114,90 @@ impl Prior {
             let mean = self.first_mean[place];
             values[place] = values[place].clamp(mean - most, mean + most);
         }
-        values[index::SHAPE] = values[index::SHAPE].max(SHAPE_MIN);
-        values[index::BEND] = values[index::BEND].max(0.0);
+        for (place, least, most) in LIMITS {
+            values[place] = values[place].clamp(least, most);
+        }
+        values
+    }
+
+    /// Returns the solution of normal equations under the limits [`LIMITS`], given the solution
+    /// `values` without them and a function that multiplies by the covariance matrix.
+    ///
+    /// A parameter beyond its limit is set to it, and all others to their conditional means, so
+    /// that they stay the best fit with the values that are used. Parameters are limited one after
+    /// the other, the farthest one first.
+    pub(super) fn limited(
+        &self,
+        mut values: Values,
+        covariance_times: impl Fn(&Values) -> Values,
+    ) -> Values {
+        let mut limited: [Option<(usize, Values)>; LIMITS.len()] = [const { None }; LIMITS.len()];
+        for number in 0..LIMITS.len() {
+            let is_free = |place: usize| limited.iter().flatten().all(|(own, _)| *own != place);
+            let beyond = |(place, least, most): (usize, f64, f64)| {
+                let at = values[place].clamp(least, most);
+                (place, at, (values[place] - at).abs() / self.std_devs[place])
+            };
+            let free = LIMITS.into_iter().filter(|(place, ..)| is_free(*place));
+            let farthest = free.map(beyond).max_by(|a, b| a.2.total_cmp(&b.2));
+            let Some((place, at, _)) = farthest.filter(|(.., beyond)| *beyond > 0.0) else {
+                break;
+            };
+            let mut gradient = Values::zeros();
+            gradient[place] = 1.0;
+            let mut covariances = covariance_times(&gradient);
+            for (other, of_other) in limited.iter().flatten() {
+                let ratio = covariances[*other] / of_other[*other];
+                covariances.axpy(-ratio, of_other, 1.0);
+            }
+            if covariances[place] <= 0.0 {
+                break;
+            }
+            values.axpy((at - values[place]) / covariances[place], &covariances, 1.0);
+            values[place] = at;
+            limited[number] = Some((place, covariances));
+        }
         values
     }
 }
 
-/// Parameters of the ground and of the tyres' friction curve on it. They start from the initial
-/// prior on new ground.
-pub(super) const OF_GROUND: [usize; 7] = [
-    index::STIFFNESS,
-    index::RESISTANCE,
+/// Parameters with limits besides the range of their prior: minimum and maximum.
+const LIMITS: [(usize, f64, f64); 4] = [
+    (index::SHAPE, SHAPE_MIN, f64::INFINITY),
+    (index::BEND, 0.0, f64::INFINITY),
+    (index::PRACTICAL_SLIP, 0.0, 1.0),
+    (index::RELAXATION_DECREASE, 0.0, RELAXATION_DECREASE_MAX),
+];
+
+/// Parameters of the tyres that start from the initial prior on each ground: the friction curve,
+/// the speed that slip is relative to, and the decrease of the relaxation length. All robots with
+/// the same tyres share the errors of their priors.
+pub(super) const OF_TYRES: [usize; 5] = [
     index::PEAK,
     index::SHAPE,
     index::BEND,
+    index::PRACTICAL_SLIP,
+    index::RELAXATION_DECREASE,
+];
+
+/// Parameters of the ground and of its contacts with the tyres. They start from the initial
+/// prior on new ground.
+pub(super) const OF_GROUND: [usize; 10] = [
+    index::STIFFNESS,
+    index::RESISTANCE,
+    index::MOTION_RESISTANCE,
+    index::PEAK,
+    index::SHAPE,
+    index::BEND,
+    index::PRACTICAL_SLIP,
+    index::RELAXATION_DECREASE,
     index::SLOPE_X,
     index::SLOPE_Y,
 ];
 
 /// Parameters of the load and the ground. Both are reset with a new load, because the friction
 /// curve of the tyres after a stop that is long enough for loading may differ.
-pub(super) const OF_LOAD_AND_GROUND: [usize; 12] = [
+pub(super) const OF_LOAD_AND_GROUND: [usize; 15] = [
     index::MASS,
     index::INERTIA,
     index::CENTRE_FORWARD,
@@ -126,9 +205,12 @@ pub(super) const OF_LOAD_AND_GROUND: [usize; 12] = [
     index::HEIGHT,
     index::STIFFNESS,
     index::RESISTANCE,
+    index::MOTION_RESISTANCE,
     index::PEAK,
     index::SHAPE,
     index::BEND,
+    index::PRACTICAL_SLIP,
+    index::RELAXATION_DECREASE,
     index::SLOPE_X,
     index::SLOPE_Y,
 ];
@@ -139,9 +221,14 @@ const LN_STIFFNESS: (f64, f64) = (1.1, 2.0);
 const LN_PEAK: (f64, f64) = (-0.6, 0.4);
 /// Means and standard deviations of the curve's shape, `1/n` and `a`.
 const SHAPE: (f64, f64) = (0.3, 0.2);
-const BEND: (f64, f64) = (0.25, 0.35);
+const BEND: (f64, f64) = (0.3, 0.45);
+/// Mean and standard deviation of the part of practical slip.
+const PRACTICAL_SLIP: (f64, f64) = (0.25, 0.35);
+/// Mean, standard deviation and maximum of the relaxation length's decrease.
+const RELAXATION_DECREASE: (f64, f64) = (0.3, 0.35);
+const RELAXATION_DECREASE_MAX: f64 = 1.5;
 /// Standard deviation of the bend that intervals assume, wider than that of the estimate's prior: a
-/// `LuGre` contact without length has the bend 1, with n = 2.
+/// lumped `LuGre` contact has the bend 1, with n = 2.
 pub(super) const INTERVAL_BEND_STD_DEV: f64 = 0.6;
 /// Minimum of `1/n`, at which the curve is practically straight up to its peak.
 pub(super) const SHAPE_MIN: f64 = 0.05;
@@ -156,8 +243,10 @@ const SLOPE_STD_DEV: f64 = 0.035;
 const TORQUE_SCALE_RATIO: f64 = 1.75;
 /// Mean and standard deviation of the gear loss, relative to the transmitted torque.
 const GEAR_LOSS: (f64, f64) = (0.025, 0.025);
-/// Mean and standard deviation of the rolling resistance coefficient.
+/// Means and standard deviations of the coefficients of rolling resistance and of motion resistance. The
+/// second one may be below 0, where slip at no force was taken for a smaller rolling radius.
 const RESISTANCE: (f64, f64) = (0.035, 0.025);
+const MOTION_RESISTANCE: (f64, f64) = (0.0, 0.015);
 /// Standard deviation of an offset of the body speed, metres per second.
 const SPEED_OFFSET_STD_DEV: f64 = 0.005;
 /// Standard deviations of the gyro's delay relative to the wheel speeds, and of the accelerometer's
@@ -207,6 +296,7 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
         ),
         (index::GEAR_LOSS, GEAR_LOSS),
         (index::RESISTANCE, RESISTANCE),
+        (index::MOTION_RESISTANCE, MOTION_RESISTANCE),
         (
             index::RADIUS,
             (0.0, noise.radius_ratio * std::f64::consts::FRAC_1_SQRT_2),
@@ -218,6 +308,8 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
         (index::PEAK, LN_PEAK),
         (index::SHAPE, SHAPE),
         (index::BEND, BEND),
+        (index::PRACTICAL_SLIP, PRACTICAL_SLIP),
+        (index::RELAXATION_DECREASE, RELAXATION_DECREASE),
         (index::GYRO_OFFSET, (0.0, noise.gyro_offset_rad_s)),
         (
             index::FORWARD_OFFSET,
@@ -258,20 +350,29 @@ pub(super) struct Robot<T> {
     pub(super) inertia_kg_m2: T,
     /// Centre of mass from the wheels' centre: forward, left, up, metres.
     pub(super) centre_m: [T; 3],
+    /// Relaxation length at zero slip, metres.
     pub(super) relaxation_m: T,
+    /// Decrease of the relaxation length with slip.
+    pub(super) relaxation_decrease: T,
     pub(super) slope: [T; 2],
     /// Ratio of measured to true torque, left and right.
     pub(super) torque_scale: [T; 2],
     /// Inertia of one side's rotors and wheels over the square of the wheel radius, kilograms.
     pub(super) rotors_kg: T,
     pub(super) gear_loss: T,
+    /// Coefficients of rolling resistance and of motion resistance.
     pub(super) resistance: T,
+    pub(super) motion_resistance: T,
     /// Rolling radius, left and right, metres.
     pub(super) radius_m: [T; 2],
     pub(super) peak: T,
+    /// `K/μ_p`, the reciprocal of the slip at which a straight curve would reach `μ_p`.
+    pub(super) per_peak_slip: T,
     /// n of the curve.
     pub(super) sharpness: T,
     pub(super) bend: T,
+    /// 0 for theoretical, 1 for practical slip.
+    pub(super) practical_slip: T,
     pub(super) gyro_offset_rad_s: T,
     pub(super) acceleration_offset_m_s2: [T; 2],
     pub(super) speed_offset_m_s: T,
@@ -295,11 +396,12 @@ impl<T: Real> Robot<T> {
             T::constant(SHAPE_MIN.recip())
         };
         let bend = of(index::BEND);
+        let (stiffness, peak) = (of(index::STIFFNESS).exp(), of(index::PEAK).exp());
         Self {
             track_m,
             wheelbase_m,
             nominal_radius_m,
-            stiffness: of(index::STIFFNESS).exp(),
+            stiffness,
             mass_kg,
             inertia_kg_m2: (of(index::MASS) + of(index::INERTIA)).exp() * model.yaw_inertia_kg_m2(),
             centre_m: [
@@ -308,22 +410,68 @@ impl<T: Real> Robot<T> {
                 of(index::HEIGHT) * track_m,
             ],
             relaxation_m: of(index::RELAXATION).exp(),
+            relaxation_decrease: of(index::RELAXATION_DECREASE),
             slope: [of(index::SLOPE_X), of(index::SLOPE_Y)],
             torque_scale: [side(-1.0), side(1.0)],
             rotors_kg: of(index::ROTORS) * (0.5 * model.mass_kg()),
             gear_loss: of(index::GEAR_LOSS),
             resistance: of(index::RESISTANCE),
+            motion_resistance: of(index::MOTION_RESISTANCE),
             radius_m: [radius(-0.5), radius(0.5)],
-            peak: of(index::PEAK).exp(),
+            peak,
+            per_peak_slip: stiffness / peak,
             sharpness,
             bend: if bend.value() < 0.0 {
                 T::constant(0.0)
             } else {
                 bend
             },
+            practical_slip: of(index::PRACTICAL_SLIP),
             gyro_offset_rad_s: of(index::GYRO_OFFSET),
             acceleration_offset_m_s2: [of(index::FORWARD_OFFSET), of(index::LEFT_OFFSET)],
             speed_offset_m_s: of(index::SPEED_OFFSET),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn limits_hold_and_all_other_parameters_are_the_best_ones_with_them(
+            off in proptest::collection::vec(-3.0..3.0, PARAMETERS),
+            rows in proptest::collection::vec(-2.0..2.0, 3 * PARAMETERS),
+        ) {
+            let prior = prior(&EstimatorPrior::default(), &SensorNoise::default());
+            let mut information = prior.information;
+            for row in rows.chunks(PARAMETERS) {
+                let slopes = Values::from_column_slice(row).component_div(&prior.std_devs);
+                information.ger(1.0, &slopes, &slopes, 1.0);
+            }
+            let free = prior.mean + Values::from_column_slice(&off).component_mul(&prior.std_devs);
+            let cholesky = information.cholesky().expect("it has the prior");
+            let limited = prior.limited(free, |gradient| cholesky.solve(gradient));
+            for (place, least, most) in LIMITS {
+                let slack = 1.0e-6 * prior.std_devs[place];
+                prop_assert!(limited[place] >= least - slack && limited[place] <= most + slack);
+            }
+            // The gradient of the cost vanishes but at a limit, where the cost falls beyond it.
+            let gradient = (information * (limited - free)).component_mul(&prior.std_devs);
+            for place in 0..PARAMETERS {
+                let limits = LIMITS.iter().find(|(own, ..)| *own == place);
+                let slack = 1.0e-6 * prior.std_devs[place];
+                let is_at = |limit: f64| (limited[place] - limit).abs() < slack;
+                let is_least = limits.is_some_and(|(_, least, _)| is_at(*least));
+                let is_most = limits.is_some_and(|(.., most)| is_at(*most));
+                prop_assert!(is_least || gradient[place] < 1.0e-6, "{place}: {}", gradient[place]);
+                prop_assert!(is_most || gradient[place] > -1.0e-6, "{place}: {}", gradient[place]);
+            }
+            let inside = prior.in_range(prior.mean);
+            prop_assert_eq!(prior.limited(inside, |gradient| cholesky.solve(gradient)), inside);
         }
     }
 }

@@ -20,6 +20,9 @@ const HUBER: f64 = 3.0;
 const SQUARE_GAIN: f64 = 0.005;
 /// Maximum squared standardised residual in that mean.
 const SQUARE_MAX: f64 = 100.0;
+/// Mean square of a block's residuals, in standard deviations that include the running mean square of
+/// their channel, above which the block's weight falls.
+const BLOCK_SQUARE_MAX: f64 = 2.0;
 /// Maximum difference of the estimates of two scales that agree, in its standard deviations.
 const AGREEMENT_STD_DEVS: f64 = 2.0;
 /// Minimum variance of that difference, relative to the variance at the longer scale.
@@ -28,12 +31,10 @@ const DIFFERENCE_MIN: f64 = 0.2;
 /// Weighted sums over linearised blocks of measurements.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Blocks {
-    /// `A = Σ Jᵀ W J`, the information matrix, and `b = Σ (Jᵀ W J p_b + g)`, the right side of the
-    /// normal equations `A p = b`.
+    /// `A = Σ Jᵀ W J`, the information matrix, and `b = Σ (Jᵀ W J p_b + g_b)`, the right side of the
+    /// normal equations `A p = b`, with the scores `g_b = Jᵀ W r` at the parameters `p_b` of the blocks.
     pub(super) information: Square,
     pub(super) preferred: Values,
-    /// `Σ g gᵀ` of the scores `g = Jᵀ W r`.
-    pub(super) scores: Square,
     /// Sum of the blocks' weights, each at most 1.
     pub(super) count: f64,
 }
@@ -44,7 +45,6 @@ impl Blocks {
         Self {
             information: Square::zeros(),
             preferred: Values::zeros(),
-            scores: Square::zeros(),
             count: 0.0,
         }
     }
@@ -54,7 +54,6 @@ impl Blocks {
         let multiply = |values: &mut [f64]| values.iter_mut().for_each(|value| *value *= ratio);
         multiply(self.information.as_mut_slice());
         multiply(self.preferred.as_mut_slice());
-        multiply(self.scores.as_mut_slice());
         self.count *= ratio;
     }
 
@@ -71,7 +70,6 @@ impl Blocks {
             other.information.as_slice(),
         );
         all(self.preferred.as_mut_slice(), other.preferred.as_slice());
-        all(self.scores.as_mut_slice(), other.scores.as_slice());
         self.count = combine(self.count, other.count);
     }
 
@@ -160,8 +158,14 @@ pub(super) struct TimeScale {
     /// `Jᵀ W J` and `g` of the open block.
     information: Square,
     pub(super) score: Values,
+    /// Mean square of the open block's standardised residuals: sum, and number of residuals.
+    squares_of_block: (f64, f64),
     /// All complete blocks of this ground.
     pub(super) ground: Blocks,
+    /// `Σ g gᵀ` of these blocks' scores g, each at the parameters that were the solution with its
+    /// block.
+    pub(super) scores: Square,
+    last_score: Values,
     /// Complete blocks of the open segment except the last one, which may already be of the next
     /// ground.
     segment: Blocks,
@@ -184,7 +188,10 @@ impl TimeScale {
             compared: 0,
             information: Square::zeros(),
             score: Values::zeros(),
+            squares_of_block: (0.0, 0.0),
             ground: Blocks::none(),
+            scores: Square::zeros(),
+            last_score: Values::zeros(),
             segment: Blocks::none(),
             last: Blocks::none(),
             squares: [1.0; CHANNELS],
@@ -259,6 +266,8 @@ impl TimeScale {
         let std_dev = compared.std_dev * seen.max(compared.square_min).sqrt();
         *seen += SQUARE_GAIN * f64::from(self.length) * (square.min(SQUARE_MAX) - *seen);
         let standardised = value.abs() / std_dev;
+        self.squares_of_block.0 += standardised.powi(2).min(SQUARE_MAX);
+        self.squares_of_block.1 += 1.0;
         let weight = std_dev.powi(-2) * (HUBER / standardised.max(HUBER));
         self.information.ger(weight, slopes, slopes, 1.0);
         self.score.axpy(weight * value, slopes, 1.0);
@@ -273,16 +282,29 @@ impl TimeScale {
     pub(super) fn drop_block(&mut self) {
         self.information.fill(0.0);
         self.score.fill(0.0);
+        self.squares_of_block = (0.0, 0.0);
         self.compared = 0;
         if self.length > 1 {
             self.means = [Mean::none(); CHANNELS];
         }
     }
 
-    /// Ends the open block, which was linearised about `values`.
-    pub(super) fn end_block(&mut self, values: &Values) {
+    /// Ends the open block, which was linearised about `values`, and solves the normal equations.
+    /// Returns the solution; None if there is none. Once the estimate `has_converged`, blocks with large
+    /// residuals get less weight.
+    pub(super) fn end_block(
+        &mut self,
+        values: &Values,
+        prior: &Prior,
+        has_converged: bool,
+    ) -> Option<Values> {
         if self.compared > 0 {
             self.end_mean();
+        }
+        let weight = self.block_weight();
+        if has_converged && weight < 1.0 {
+            self.information *= weight;
+            self.score *= weight;
         }
         let keeps = 1.0 - BLOCK_DECAY;
         self.segment
@@ -291,19 +313,43 @@ impl TimeScale {
         std::mem::swap(&mut last.information, &mut self.information);
         last.preferred = self.score;
         last.preferred.gemv(1.0, &last.information, values, 1.0);
-        last.scores.ger(1.0, &self.score, &self.score, 0.0);
         last.count = 1.0;
         self.ground
             .combine(&self.last, |own, last| own * keeps + last);
+        let solution = self.solve(prior);
+        // The score at the solution: where a block begins far from it, as the first ones do,
+        // residuals there are due to the wrong parameters, and are no noise.
+        self.last_score = self.last.preferred;
+        self.last_score.gemv(
+            -1.0,
+            &self.last.information,
+            &solution.unwrap_or(*values),
+            1.0,
+        );
+        self.scores
+            .ger(1.0, &self.last_score, &self.last_score, keeps);
         self.drop_block();
+        solution
     }
 
-    /// Solves the normal equations of the ground's blocks and the prior. Returns the parameters;
-    /// None if they cannot be solved.
+    /// Returns the weight of the open block, at most 1: less where its residuals are much larger
+    /// than usual, as when the robot stops at once.
+    fn block_weight(&self) -> f64 {
+        let (sum, count) = self.squares_of_block;
+        if sum > BLOCK_SQUARE_MAX * count {
+            (BLOCK_SQUARE_MAX * count / sum).powi(2)
+        } else {
+            1.0
+        }
+    }
+
+    /// Solves the normal equations of the ground's blocks and the prior. Returns the parameters
+    /// under their limits; None if the equations cannot be solved.
     pub(super) fn solve(&mut self, prior: &Prior) -> Option<Values> {
         let cholesky = (self.ground.information + prior.information).cholesky()?;
         self.stiffness_covariance = cholesky.solve(&ln_stiffness_gradient());
         let solution = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
+        let solution = prior.limited(solution, |gradient| cholesky.solve(gradient));
         self.ln_stiffness = solution[index::STIFFNESS];
         Some(solution)
     }
@@ -329,6 +375,8 @@ impl TimeScale {
         self.ground.multiply(ratio);
         self.segment.multiply(ratio);
         self.last.multiply(ratio);
+        self.scores *= ratio;
+        self.last_score *= ratio.sqrt();
     }
 
     /// Returns the increase of the variance of ln K if the bend of the friction curve has the standard
@@ -340,6 +388,11 @@ impl TimeScale {
         let assumed = prior.std_devs[index::BEND].powi(2);
         let added = (INTERVAL_BEND_STD_DEV.powi(2) - assumed).max(0.0);
         (self.stiffness_covariance[index::BEND] / assumed).powi(2) * added
+    }
+
+    /// Returns the part of ln K's variance that the prior of the tyres contributes.
+    pub(super) fn tyre_variance(&self, prior: &Prior) -> f64 {
+        prior.tyre_variance(&self.stiffness_covariance)
     }
 
     /// Returns the variance of ln K, and the part of it that the prior contributes. The first is at
@@ -360,13 +413,16 @@ impl TimeScale {
     pub(super) fn scattered(&self) -> f64 {
         // The scatter of few scores underestimates their variance.
         let few = 1.0 + 2.0 / self.ground.count.max(1.0);
-        few * (self.ground.scores * self.stiffness_covariance).dot(&self.stiffness_covariance)
+        few * (self.scores * self.stiffness_covariance).dot(&self.stiffness_covariance)
     }
 
     /// Drops the last block, which may contain samples of two grounds.
     pub(super) fn drop_last_block(&mut self) {
         self.ground.subtract(&self.last);
         self.last = Blocks::none();
+        self.scores
+            .ger(-1.0, &self.last_score, &self.last_score, 1.0);
+        self.last_score.fill(0.0);
     }
 
     /// Takes the blocks of the open segment; the ground keeps them.
@@ -374,6 +430,7 @@ impl TimeScale {
         let mut segment = std::mem::replace(&mut self.segment, Blocks::none());
         segment.add(&self.last);
         self.last = Blocks::none();
+        self.last_score.fill(0.0);
         segment
     }
 }
@@ -383,4 +440,59 @@ pub(super) fn ln_stiffness_gradient() -> Values {
     let mut stiffness = Values::zeros();
     stiffness[index::STIFFNESS] = 1.0;
     stiffness
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::parameters;
+    use super::*;
+    use crate::estimation::{EstimatorPrior, SensorNoise};
+
+    /// Ends a block with one residual in each of ten comparisons.
+    fn end_block(scale: &mut TimeScale, prior: &Prior, value: f64) {
+        for turn in 0..10 {
+            let mut slopes = Values::zeros();
+            slopes[index::STIFFNESS] = 0.3;
+            slopes[index::MASS] = 0.1 * f64::from(turn % 3);
+            let residual = Residual { value, slopes };
+            let compared = ChannelResidual {
+                residual,
+                noise: Residual::none(),
+                std_dev: 0.1,
+                square_min: 0.3,
+            };
+            scale.add(0, &compared);
+            scale.end_comparison();
+        }
+        scale.end_block(&prior.mean, prior, false);
+    }
+
+    #[test]
+    fn a_dropped_block_leaves_the_scores_of_all_others() {
+        let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
+        let mut scale = TimeScale::new(1);
+        end_block(&mut scale, &prior, 0.2);
+        let first = scale.scores;
+        end_block(&mut scale, &prior, -0.1);
+        let both = scale.scores;
+        assert!(both.norm() > 1.01 * first.norm());
+        // As a step of ln K and its restoration do.
+        scale.scale_weights(0.2);
+        scale.drop_last_block();
+        scale.scale_weights(5.0);
+        let kept = first * (1.0 - BLOCK_DECAY);
+        assert!((scale.scores - kept).norm() < 1.0e-9 * kept.norm());
+    }
+
+    #[test]
+    fn a_segment_that_is_taken_keeps_its_last_block_in_the_ground() {
+        let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
+        let mut scale = TimeScale::new(1);
+        end_block(&mut scale, &prior, 0.2);
+        scale.take_segment();
+        let before = scale.clone();
+        scale.drop_last_block();
+        assert_eq!(scale.scores, before.scores);
+        assert_eq!(scale.ground, before.ground);
+    }
 }

@@ -173,3 +173,17 @@ impl Simulation<Number> {
         self.state.deflections.iter_mut().flatten().for_each(shift);
     }
 }
+
+/// Output of one channel, and that of the model with noise added to the wheel speeds.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ChannelOutput {
+    pub(super) output: Predicted,
+    pub(super) perturbed: Option<Predicted>,
+}
+
+impl ChannelOutput {
+    /// Returns the output without slopes.
+    pub(super) fn value(&self) -> f64 {
+        self.output.value
+    }
+}
