@@ -213,27 +213,26 @@ fn a_robot_that_is_held_while_its_wheels_turn_has_finite_forces() {
     }
 }
 
-/// Speed of a robot that climbs a slope of 10 % on K 1, relative to that of its rims: after so many
-/// samples of 10 ms, from rolling without slip.
-fn speed_uphill(change: impl Fn(&mut Values), samples: u32) -> f64 {
+/// Speed relative to that of its rims of a robot that drives straight on K 1, after so many samples of 10 ms
+/// from rolling without slip, and the torque of its left side over load and wheel radius.
+fn drive_straight(change: impl Fn(&mut Values), samples: u32) -> (f64, f64) {
     let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
     let mut values = prior.mean;
     for (place, value) in [
         (index::STIFFNESS, 0.0),
-        (index::SLOPE_X, 0.1),
-        // A curve that is straight far beyond the slip of this slope.
+        // A curve that is straight far beyond the slip of the drive.
         (index::PEAK, 1.0_f64.ln()),
         (index::SHAPE, 0.05),
         (index::BEND, 0.0),
+        (index::PRACTICAL_SLIP, 0.0),
     ] {
         values[place] = value;
     }
     change(&mut values);
     let model = RobotModel::yi2007();
     let robot: Robot<f64> = Robot::new(&std::array::from_fn(|place| values[place]), &model);
-    let wheel_rad_s = 1.0 / model.wheel_radius_m();
     let input = Input {
-        wheels_rad_s: [wheel_rad_s; 2],
+        wheels_rad_s: [1.0 / model.wheel_radius_m(); 2],
         wheels_rad_s2: [0.0; 2],
         heading_rad: 0.0,
         acceleration_m_s2: [0.0; 2],
@@ -244,10 +243,21 @@ fn speed_uphill(change: impl Fn(&mut Values), samples: u32) -> f64 {
         linear_m_s: 1.0,
         angular_rad_s: 0.0,
     });
+    let mut torque_n_m = 0.0;
     for _ in 0..samples {
-        robot.advance(&mut state, &input);
+        torque_n_m = robot.advance(&mut state, &input).torques_n_m[0];
     }
-    state.speed_m_s[0]
+    let load_n_m = 0.5 * robot.mass_kg * crate::robot::GRAVITY_M_S2 * model.wheel_radius_m();
+    (state.speed_m_s[0], torque_n_m / load_n_m)
+}
+
+/// The speed of that robot on a slope of 10 %.
+fn speed_uphill(change: impl Fn(&mut Values), samples: u32) -> f64 {
+    let uphill = |values: &mut Values| {
+        values[index::SLOPE_X] = 0.1;
+        change(values);
+    };
+    drive_straight(uphill, samples).0
 }
 
 #[test]
@@ -328,41 +338,18 @@ fn the_interval_contains_more_bent_tyres_where_the_drive_does_not_show_the_bend(
 #[test]
 fn motion_resistance_takes_slip_and_torque_and_rolling_resistance_torque_alone() {
     let drive = |place: usize| {
-        let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
-        let mut values = prior.mean;
-        for (of_robot, value) in [
-            (index::STIFFNESS, 0.0),
-            (index::PEAK, 1.0_f64.ln()),
-            (index::SHAPE, 0.05),
-            (index::BEND, 0.0),
-            (index::PRACTICAL_SLIP, 0.0),
-            (index::RESISTANCE, 0.0),
-            (index::MOTION_RESISTANCE, 0.0),
-            (index::GEAR_LOSS, 0.0),
-        ] {
-            values[of_robot] = value;
-        }
-        values[place] = 0.05;
-        let model = RobotModel::yi2007();
-        let robot: Robot<f64> = Robot::new(&std::array::from_fn(|place| values[place]), &model);
-        let input = Input {
-            wheels_rad_s: [1.0 / model.wheel_radius_m(); 2],
-            wheels_rad_s2: [0.0; 2],
-            heading_rad: 0.0,
-            acceleration_m_s2: [0.0; 2],
-            is_specific_force: false,
-            time_s: SAMPLE_S,
+        let change = |values: &mut Values| {
+            for lost in [
+                index::RESISTANCE,
+                index::MOTION_RESISTANCE,
+                index::GEAR_LOSS,
+            ] {
+                values[lost] = 0.0;
+            }
+            values[place] = 0.05;
         };
-        let mut state = State::rolling(Twist {
-            linear_m_s: 1.0,
-            angular_rad_s: 0.0,
-        });
-        let mut torque_n_m = 0.0;
-        for _ in 0..1_000 {
-            torque_n_m = robot.advance(&mut state, &input).torques_n_m[0];
-        }
-        let load_n_m = 0.5 * robot.mass_kg * crate::robot::GRAVITY_M_S2 * model.wheel_radius_m();
-        (1.0 - state.speed_m_s[0], torque_n_m / load_n_m)
+        let (speed_m_s, torque) = drive_straight(change, 1_000);
+        (1.0 - speed_m_s, torque)
     };
     for (place, slip) in [(index::MOTION_RESISTANCE, 0.05), (index::RESISTANCE, 0.0)] {
         let (found, torque) = drive(place);
