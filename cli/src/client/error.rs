@@ -358,6 +358,28 @@ impl ClientError {
         }
     }
 
+    /// Returns whether the same request may succeed later: the server was not reached, or was too busy
+    /// to answer, itself or behind a proxy.
+    pub(crate) fn is_temporary(&self) -> bool {
+        match self {
+            Self::Unreachable { .. } | Self::Silent { .. } => true,
+            Self::Refused { problem } => matches!(
+                problem.kind,
+                ProblemType::Unavailable | ProblemType::Timeout | ProblemType::TooManyRequests
+            ),
+            Self::NotUnderstood { status, .. } => matches!(status.as_u16(), 502..=504),
+            Self::Address { .. }
+            | Self::ClearText { .. }
+            | Self::Authority { .. }
+            | Self::Tls(_)
+            | Self::Untrusted { .. }
+            | Self::NoSuchMission { .. }
+            | Self::NoSuchWebhook { .. }
+            | Self::AmbiguousMission { .. }
+            | Self::NoWebSocket { .. } => false,
+        }
+    }
+
     /// Returns the problem that the server answered; `None` for any other error.
     pub(crate) fn problem(&self) -> Option<&ProblemBody> {
         match self {

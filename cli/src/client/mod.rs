@@ -6,6 +6,7 @@ mod fleet;
 mod identity;
 mod map;
 mod missions;
+mod outage;
 mod safety;
 mod webhooks;
 
@@ -25,6 +26,7 @@ use tread_api::text;
 
 pub(crate) use self::error::ClientError;
 pub(crate) use self::map::{Area, HistoryTimes, MapTimes, Reading, TimedEntries};
+pub(crate) use self::outage::Outage;
 
 /// Maximum time for an answer; planning the longest path takes several seconds.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(30);

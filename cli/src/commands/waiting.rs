@@ -13,7 +13,7 @@ use tread_api::mission::{Mission, MissionState};
 use super::mission_text::{state, summary};
 use super::robots::steps_driven;
 use crate::args::format_duration;
-use crate::client::Client;
+use crate::client::{Client, Outage};
 use crate::output::{Output, WaitTimeout, print_note};
 
 /// Polling period of the missions.
@@ -59,11 +59,12 @@ impl AwaitedMission {
     }
 }
 
-/// Waits until the missions have ended and returns them in the order of `missions`.
+/// Waits until the missions have ended and returns them in the order of `missions`. A short outage of
+/// the server does not end it, because the missions continue without the server.
 ///
 /// # Errors
 /// [`WaitTimeout`] if they have not ended within `allowed`; the missions continue.
-/// [`ClientError`](crate::client::ClientError) if a request fails.
+/// [`ClientError`](crate::client::ClientError) if a request fails for good.
 pub(super) async fn wait(
     client: &Client,
     missions: &[MissionId],
@@ -92,7 +93,15 @@ pub(super) async fn wait(
             ended: None,
         })
         .collect();
+    let notify = |note: &str| {
+        if bars {
+            all.suspend(|| print_note(note));
+        } else if lines {
+            print_note(note);
+        }
+    };
     let begin = Instant::now();
+    let mut outage = Outage::default();
     loop {
         let open: Vec<MissionId> = waited
             .iter()
@@ -100,7 +109,8 @@ pub(super) async fn wait(
             .map(|waited| waited.id)
             .collect();
         let requests = open.iter().map(|id| client.mission(*id));
-        for detail in try_join_all(requests).await? {
+        let answers = outage.bridge(try_join_all(requests).await, notify)?;
+        for detail in answers.into_iter().flatten() {
             let seen = detail.mission;
             let awaited = waited.iter_mut().find(|waited| waited.id == seen.id);
             if let Some(awaited) = awaited {

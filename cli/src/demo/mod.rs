@@ -26,7 +26,7 @@ use self::processes::Processes;
 use self::progress::Progress;
 use self::report::Report;
 use crate::args::DemoArguments;
-use crate::client::{Client, ClientError, Reading, TrustAnchor};
+use crate::client::{Client, ClientError, Outage, Reading, TrustAnchor};
 use crate::credentials::{self, Entry, Store};
 use crate::output::{json_line, line, print_note};
 use crate::signals::ShutdownSignals;
@@ -371,20 +371,28 @@ impl<'demo> Watch<'demo> {
 
     /// Returns when all missions have ended and all measurements are uploaded, or when the time is
     /// over. Without a time limit it shows the fleet until it is cancelled.
+    ///
+    /// # Errors
+    /// A process has ended, or the server does not answer any more.
     async fn until_done(&mut self, processes: &mut Processes) -> anyhow::Result<()> {
         let mut ticks = tokio::time::interval(POLL_INTERVAL);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut uploads_until: Option<Instant> = None;
+        let mut outage = Outage::default();
         loop {
             ticks.tick().await;
             processes.all_alive()?;
-            let robots = self.poll().await?;
+            let polled = self.poll().await;
+            let robots = outage.bridge(polled, |note| self.progress.notify(note))?;
             let Some(exit_after) = self.exit_after else {
                 continue;
             };
             if self.begin.elapsed() >= exit_after {
                 break;
             }
+            let Some(robots) = robots else {
+                continue;
+            };
             if self.seen.iter().all(|mission| mission.state.is_terminal()) {
                 let until = *uploads_until.get_or_insert(Instant::now() + UPLOAD_WAIT_MAX);
                 let uploaded = |robot: &Robot| {
@@ -401,7 +409,7 @@ impl<'demo> Watch<'demo> {
         Ok(())
     }
 
-    async fn poll(&mut self) -> anyhow::Result<Vec<Robot>> {
+    async fn poll(&mut self) -> Result<Vec<Robot>, ClientError> {
         let robots = self.demo.present_robots().await?;
         let site = &self.demo.scenario.site;
         let page = self

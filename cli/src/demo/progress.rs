@@ -6,11 +6,15 @@ use tread_api::ids::RobotId;
 use tread_api::mission::{Mission, MissionState};
 use tread_api::robot::Robot;
 
+use crate::output::print_note;
+
 /// Number of steps of a bar.
 const STEPS: u64 = 1_000;
 
 /// Bars of the robots; hidden unless a person sees them.
 pub(super) struct Progress {
+    all: MultiProgress,
+    shown: bool,
     lines: Vec<(RobotId, ProgressBar)>,
 }
 
@@ -30,8 +34,14 @@ impl Progress {
             bar.set_prefix(robot.id.to_string());
             (robot.id.clone(), bar)
         };
-        Self {
-            lines: robots.iter().map(line).collect(),
+        let lines = robots.iter().map(line).collect();
+        Self { all, shown, lines }
+    }
+
+    /// Prints a note above the bars.
+    pub(super) fn notify(&self, note: &str) {
+        if self.shown {
+            self.all.suspend(|| print_note(note));
         }
     }
 

@@ -13,6 +13,7 @@ mod first_steps;
 mod manual;
 mod operator;
 mod terminal;
+mod waiting;
 mod watch;
 mod webhooks;
 mod yard;

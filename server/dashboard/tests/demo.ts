@@ -16,6 +16,8 @@ declare module 'vitest' {
 
 /** How long the fleet may take until it is there, milliseconds. */
 const START_MAX_MS = 60_000;
+/** How much of the demo's output is kept, characters. */
+const OUTPUT_MAX = 20_000;
 
 function needed(name: string, hint: string): string {
   const value = process.env[name];
@@ -43,11 +45,20 @@ export default async function setup(project: TestProject): Promise<() => Promise
     stdio: ['ignore', 'pipe', 'pipe'],
   });
   const server = await address(demo);
+  // All tests that follow would fail without a reason.
+  let output = '';
+  for (const stream of [demo.stdout, demo.stderr]) {
+    stream?.on('data', (chunk: Buffer) => (output = (output + chunk.toString()).slice(-OUTPUT_MAX)));
+  }
+  const report = (code: number | null, signal: string | null) =>
+    console.error(`the demo ended during the tests with ${code ?? signal}; its output:\n${output}`);
+  demo.once('exit', report);
   project.provide('server', server);
   project.provide('token', readFileSync(join(folder, 'admin.token'), 'utf8').trim());
   project.provide('demoPid', demo.pid ?? 0);
   project.provide('chromium', chromium);
   return async () => {
+    demo.off('exit', report);
     const ended = new Promise((resolve) => demo.once('exit', resolve));
     demo.kill('SIGINT');
     await ended;

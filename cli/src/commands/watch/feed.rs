@@ -66,7 +66,8 @@ impl<'client> Feed<'client> {
                 Ok(()) => {}
                 Err(error) => {
                     let refused = error.downcast_ref::<ClientError>();
-                    let is_refused = refused.is_some_and(|error| error.problem().is_some());
+                    let is_refused = refused
+                        .is_some_and(|error| error.problem().is_some() && !error.is_temporary());
                     if !self.was_open || is_refused {
                         return Err(error);
                     }

@@ -1,0 +1,126 @@
+//! Outages of the server during a command that polls it.
+
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+use super::ClientError;
+
+/// Maximum duration of an outage that a command waits out: enough to restart a server, or for a
+/// standby to take over.
+const OUTAGE_MAX: Duration = Duration::from_mins(1);
+
+/// Whether the server answers a request that is repeated.
+#[derive(Debug, Default)]
+pub(crate) struct Outage {
+    since: Option<Instant>,
+}
+
+impl Outage {
+    /// Returns the answer to a repeated request; `None` if it failed for a time, so that it is to be
+    /// repeated. `notify` is told when an outage begins and when it is over.
+    ///
+    /// # Errors
+    /// The request will not succeed if it is repeated, or the outage lasts longer than a minute.
+    pub(crate) fn bridge<T>(
+        &mut self,
+        answer: Result<T, ClientError>,
+        notify: impl FnOnce(&str),
+    ) -> Result<Option<T>, ClientError> {
+        self.bridge_at(Instant::now(), answer, notify)
+    }
+
+    fn bridge_at<T>(
+        &mut self,
+        now: Instant,
+        answer: Result<T, ClientError>,
+        notify: impl FnOnce(&str),
+    ) -> Result<Option<T>, ClientError> {
+        let error = match answer {
+            Ok(answer) => {
+                if self.since.take().is_some() {
+                    notify("the server answers again");
+                }
+                return Ok(Some(answer));
+            }
+            Err(error) if error.is_temporary() => error,
+            Err(error) => return Err(error),
+        };
+        let Some(since) = self.since else {
+            self.since = Some(now);
+            notify(&format!(
+                "{error}; trying again for {} s",
+                OUTAGE_MAX.as_secs()
+            ));
+            return Ok(None);
+        };
+        if now.duration_since(since) < OUTAGE_MAX {
+            Ok(None)
+        } else {
+            Err(error)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tread_api::problem::{ProblemBody, ProblemType};
+
+    use super::*;
+
+    fn refusal(kind: ProblemType, status: u16) -> Result<(), ClientError> {
+        let problem = Box::new(ProblemBody {
+            kind,
+            title: kind.title().to_owned(),
+            status,
+            detail: None,
+            field: None,
+            state: None,
+            place: None,
+        });
+        Err(ClientError::Refused { problem })
+    }
+
+    fn unavailable() -> Result<(), ClientError> {
+        refusal(ProblemType::Unavailable, 503)
+    }
+
+    #[test]
+    fn a_short_outage_is_bridged_and_told_once() {
+        let mut now = Instant::now();
+        let mut outage = Outage::default();
+        let mut told = Vec::new();
+        for answer in [Ok(()), unavailable(), unavailable(), Ok(()), unavailable()] {
+            let is_answered = answer.is_ok();
+            let bridged = outage.bridge_at(now, answer, |note| told.push(note.to_owned()));
+            assert_eq!(bridged.unwrap().is_some(), is_answered);
+            now += OUTAGE_MAX / 3;
+        }
+        assert_eq!(told.len(), 3, "{told:?}");
+        assert!(told[0].ends_with("trying again for 60 s"), "{told:?}");
+        assert_eq!(told[1], "the server answers again");
+    }
+
+    #[test]
+    fn a_long_outage_is_an_error() {
+        let begin = Instant::now();
+        let mut outage = Outage::default();
+        let first = outage.bridge_at(begin, unavailable(), |_| ());
+        assert!(first.unwrap().is_none());
+        let last = outage.bridge_at(begin + OUTAGE_MAX, unavailable(), |_| ());
+        last.unwrap_err();
+    }
+
+    #[test]
+    fn what_will_not_succeed_later_is_an_error_at_once() {
+        let refusals = [
+            (ProblemType::Unauthenticated, 401),
+            (ProblemType::UnknownMission, 404),
+            (ProblemType::RobotUnreachable, 503),
+        ];
+        for (kind, status) in refusals {
+            let bridged = Outage::default().bridge(refusal(kind, status), |_| ());
+            bridged.expect_err(kind.title());
+        }
+    }
+}
