@@ -18,7 +18,7 @@ pub(crate) struct Outage {
 
 impl Outage {
     /// Returns the answer to a repeated request; `None` if it failed for a time, so that it is to be
-    /// repeated. `notify` is told when an outage begins and when it is over.
+    /// repeated. `notify` is called when an outage begins and when it is over.
     ///
     /// # Errors
     /// The request will not succeed if it is repeated, or the outage lasts longer than a minute.
@@ -86,19 +86,19 @@ mod tests {
     }
 
     #[test]
-    fn a_short_outage_is_bridged_and_told_once() {
+    fn a_short_outage_is_bridged_and_reported_once() {
         let mut now = Instant::now();
         let mut outage = Outage::default();
-        let mut told = Vec::new();
+        let mut notes = Vec::new();
         for answer in [Ok(()), unavailable(), unavailable(), Ok(()), unavailable()] {
             let is_answered = answer.is_ok();
-            let bridged = outage.bridge_at(now, answer, |note| told.push(note.to_owned()));
+            let bridged = outage.bridge_at(now, answer, |note| notes.push(note.to_owned()));
             assert_eq!(bridged.unwrap().is_some(), is_answered);
             now += OUTAGE_MAX / 3;
         }
-        assert_eq!(told.len(), 3, "{told:?}");
-        assert!(told[0].ends_with("trying again for 60 s"), "{told:?}");
-        assert_eq!(told[1], "the server answers again");
+        assert_eq!(notes.len(), 3, "{notes:?}");
+        assert!(notes[0].ends_with("trying again for 60 s"), "{notes:?}");
+        assert_eq!(notes[1], "the server answers again");
     }
 
     #[test]

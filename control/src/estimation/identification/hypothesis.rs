@@ -324,7 +324,7 @@ impl Hypothesis {
         };
         let range_square = range.powi(2) + share * self.scale().nominal_variance();
         let weight_factor = (-3.0 * step[index::STIFFNESS].powi(2) / range_square).exp();
-        self.variance_before_step = self.variances(prior).0;
+        self.variance_before_step = self.scale().variance();
         self.scales.scale_weights(weight_factor);
         let limit = if self.age <= CONVERGES_BLOCKS {
             REFRESH_BELOW_EARLY
@@ -339,6 +339,11 @@ impl Hypothesis {
             self.fast.clear();
         }
         self.values.iter().all(|value| value.is_finite())
+    }
+
+    /// Solves the equations that were deferred at the end of the last block.
+    pub(super) fn finish_block(&mut self, prior: &Prior) {
+        self.scales.finish_block(prior);
     }
 
     /// Returns the maximum magnitude of the change of ln K at the end of a block. Once the estimate
@@ -423,8 +428,7 @@ impl Hypothesis {
             return None;
         }
         let mut others = ground.information - segment.information + prior.information;
-        let mut information_vector =
-            ground.preferred - segment.preferred + prior.information * prior.mean;
+        let mut information_vector = ground.preferred - segment.preferred + prior.preferred;
         // K of the other blocks is marginalised.
         let of_stiffness: Values = others.column(index::STIFFNESS).into();
         let most = of_stiffness[index::STIFFNESS];
@@ -468,10 +472,10 @@ impl Hypothesis {
         }
         let information = covariance.cholesky()?.inverse();
         let is_known = information.iter().all(|value| value.is_finite());
-        is_known.then(|| Prior {
-            mean,
-            information,
-            ..prior.clone()
+        is_known.then(|| {
+            let mut posterior = prior.clone();
+            posterior.set(&mean, &information);
+            posterior
         })
     }
 }

@@ -9,6 +9,7 @@
 //! nonlinear, so three estimators start at different values of K; those that fit worse are
 //! discarded.
 
+mod blocks;
 mod change;
 mod dual;
 mod fast_changes;
@@ -351,6 +352,10 @@ impl Identification {
         self.add(sample, measured, rims_m_s, time_s);
         let share = time_s / COMPARED_S;
         let square_min = self.weight_square_min();
+        if self.compared_s >= 0.5 * COMPARED_S {
+            // In another tick than the end of the block, which takes long enough.
+            self.finish_block();
+        }
         let speed = sample.body_speed_m_s.map(|value| Measured {
             channel: CHANNELS - 1,
             value,
@@ -397,6 +402,7 @@ impl Identification {
     /// Compares the means over [`COMPARED_S`], and ends the block where it is full. Returns whether
     /// the ground has changed.
     fn compare(&mut self, noise: &SensorNoise) -> bool {
+        self.finish_block();
         let torque_n_m = self.model.side_load_n() * self.model.wheel_radius_m();
         let root = self.samples.max(1.0).sqrt();
         let with_model = |sensor: f64, model: f64| (sensor / root).hypot(model);
@@ -501,6 +507,13 @@ impl Identification {
         }
         self.restart_with_wheel_noise();
         self.update_change_monitor();
+    }
+
+    /// Solves what the hypotheses deferred at the end of the last block.
+    fn finish_block(&mut self) {
+        for hypothesis in &mut self.hypotheses {
+            hypothesis.finish_block(&self.prior);
+        }
     }
 
     /// Gives the change monitor the best hypothesis, if its ln K is known well enough; otherwise

@@ -85,6 +85,8 @@ pub(super) struct Prior {
     pub(super) mean: Values,
     /// Information matrix, the inverse of the covariance.
     pub(super) information: Square,
+    /// Information matrix times mean: the prior's part of the right side of the normal equations.
+    pub(super) preferred: Values,
     /// Standard deviations of the initial prior, before any measurement. They scale the maximum
     /// step and the range of each parameter.
     pub(super) std_devs: Values,
@@ -95,8 +97,16 @@ pub(super) struct Prior {
 impl Prior {
     /// Resets to the initial prior of independent parameters.
     pub(super) fn reset(&mut self) {
-        self.mean = self.first_mean;
-        self.information = Square::from_diagonal(&self.std_devs.map(|std_dev| std_dev.powi(-2)));
+        let information = Square::from_diagonal(&self.std_devs.map(|std_dev| std_dev.powi(-2)));
+        let mean = self.first_mean;
+        self.set(&mean, &information);
+    }
+
+    /// Replaces mean and information matrix.
+    pub(super) fn set(&mut self, mean: &Values, information: &Square) {
+        self.mean = *mean;
+        self.information = *information;
+        self.preferred = information * mean;
     }
 
     /// Returns the variance that the prior of the tyres' parameters [`OF_TYRES`] contributes to a
@@ -327,6 +337,7 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
     let mut initial = Prior {
         mean: Values::zeros(),
         information: Square::zeros(),
+        preferred: Values::zeros(),
         std_devs: Values::zeros(),
         first_mean: Values::zeros(),
     };

@@ -8,6 +8,7 @@
 //! at more than one scale, and the shorter scale is used only as long as its estimate agrees with
 //! that of the longer one (the specification test of Hausman, Econometrica 46, 1978).
 
+use super::blocks::{Blocks, add_outer_square, multiply};
 use super::model::CHANNELS;
 use super::parameters::{INTERVAL_BEND_STD_DEV, Prior, Square, Values, index};
 
@@ -27,60 +28,6 @@ const BLOCK_SQUARE_MAX: f64 = 2.0;
 const AGREEMENT_STD_DEVS: f64 = 2.0;
 /// Minimum variance of that difference, relative to the variance at the longer scale.
 const DIFFERENCE_MIN: f64 = 0.2;
-
-/// Weighted sums over linearised blocks of measurements.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Blocks {
-    /// `A = Σ Jᵀ W J`, the information matrix, and `b = Σ (Jᵀ W J p_b + g_b)`, the right side of the
-    /// normal equations `A p = b`, with the scores `g_b = Jᵀ W r` at the parameters `p_b` of the blocks.
-    pub(super) information: Square,
-    pub(super) preferred: Values,
-    /// Sum of the blocks' weights, each at most 1.
-    pub(super) count: f64,
-}
-
-impl Blocks {
-    /// Returns the sums over no blocks.
-    fn none() -> Self {
-        Self {
-            information: Square::zeros(),
-            preferred: Values::zeros(),
-            count: 0.0,
-        }
-    }
-
-    /// Multiplies the weights of all blocks.
-    fn multiply(&mut self, ratio: f64) {
-        let multiply = |values: &mut [f64]| values.iter_mut().for_each(|value| *value *= ratio);
-        multiply(self.information.as_mut_slice());
-        multiply(self.preferred.as_mut_slice());
-        self.count *= ratio;
-    }
-
-    /// Replaces each sum by what `combine` makes of it and of that of `other`. In place, because
-    /// copies of the matrices would take most of the time.
-    fn combine(&mut self, other: &Self, combine: impl Fn(f64, f64) -> f64) {
-        let all = |own: &mut [f64], other: &[f64]| {
-            for (own, other) in own.iter_mut().zip(other) {
-                *own = combine(*own, *other);
-            }
-        };
-        all(
-            self.information.as_mut_slice(),
-            other.information.as_slice(),
-        );
-        all(self.preferred.as_mut_slice(), other.preferred.as_slice());
-        self.count = combine(self.count, other.count);
-    }
-
-    fn add(&mut self, other: &Self) {
-        self.combine(other, |own, other| own + other);
-    }
-
-    fn subtract(&mut self, other: &Self) {
-        self.combine(other, |own, other| own - other);
-    }
-}
 
 /// A residual or a mean of residuals, with the slopes of the output.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -175,8 +122,9 @@ pub(super) struct TimeScale {
     /// Nominal covariances of ln K with all parameters: the column of C for ln K, with C as in the
     /// module `hypothesis`.
     pub(super) stiffness_covariance: Values,
-    /// Solution of the normal equations for ln K.
+    /// Solution of the normal equations for ln K, and its variance with the weights of then.
     ln_stiffness: f64,
+    variance: f64,
 }
 
 impl TimeScale {
@@ -197,6 +145,7 @@ impl TimeScale {
             squares: [1.0; CHANNELS],
             stiffness_covariance: Values::zeros(),
             ln_stiffness: 0.0,
+            variance: 0.0,
         }
     }
 
@@ -269,19 +218,19 @@ impl TimeScale {
         self.squares_of_block.0 += standardised.powi(2).min(SQUARE_MAX);
         self.squares_of_block.1 += 1.0;
         let weight = std_dev.powi(-2) * (HUBER / standardised.max(HUBER));
-        self.information.ger(weight, slopes, slopes, 1.0);
+        add_outer_square(&mut self.information, weight, slopes);
         self.score.axpy(weight * value, slopes, 1.0);
         let Residual { value, slopes } = &compared.noise;
         if *value != 0.0 {
-            self.information.ger(-weight, slopes, slopes, 1.0);
+            add_outer_square(&mut self.information, -weight, slopes);
             self.score.axpy(weight * value, slopes, 1.0);
         }
     }
 
     /// Drops the measurements of the open block.
     pub(super) fn drop_block(&mut self) {
-        self.information.fill(0.0);
-        self.score.fill(0.0);
+        self.information.as_mut_slice().fill(0.0);
+        self.score.as_mut_slice().fill(0.0);
         self.squares_of_block = (0.0, 0.0);
         self.compared = 0;
         if self.length > 1 {
@@ -289,22 +238,16 @@ impl TimeScale {
         }
     }
 
-    /// Ends the open block, which was linearised about `values`, and solves the normal equations.
-    /// Returns the solution; None if there is none. Once the estimate `has_converged`, blocks with large
-    /// residuals get less weight.
-    pub(super) fn end_block(
-        &mut self,
-        values: &Values,
-        prior: &Prior,
-        has_converged: bool,
-    ) -> Option<Values> {
+    /// Ends the open block, which was linearised about `values`, and adds it to the ground. Once the
+    /// estimate `has_converged`, a block with large residuals gets less weight.
+    pub(super) fn close_block(&mut self, values: &Values, has_converged: bool) {
         if self.compared > 0 {
             self.end_mean();
         }
         let weight = self.block_weight();
         if has_converged && weight < 1.0 {
-            self.information *= weight;
-            self.score *= weight;
+            multiply(self.information.as_mut_slice(), weight);
+            multiply(self.score.as_mut_slice(), weight);
         }
         let keeps = 1.0 - BLOCK_DECAY;
         self.segment
@@ -316,7 +259,13 @@ impl TimeScale {
         last.count = 1.0;
         self.ground
             .combine(&self.last, |own, last| own * keeps + last);
-        let solution = self.solve(prior);
+        self.drop_block();
+    }
+
+    /// Solves the normal equations with the last block, which was linearised about `values`, and
+    /// adds its score. Returns the solution; None if there is none.
+    pub(super) fn solve_with_block(&mut self, values: &Values, prior: &Prior) -> Option<Values> {
+        let solution = self.solve_equations(prior);
         // The score at the solution: where a block begins far from it, as the first ones do,
         // residuals there are due to the wrong parameters, and are no noise.
         self.last_score = self.last.preferred;
@@ -327,8 +276,8 @@ impl TimeScale {
             1.0,
         );
         self.scores
-            .ger(1.0, &self.last_score, &self.last_score, keeps);
-        self.drop_block();
+            .ger(1.0, &self.last_score, &self.last_score, 1.0 - BLOCK_DECAY);
+        self.variance = self.variances(prior).0;
         solution
     }
 
@@ -343,12 +292,18 @@ impl TimeScale {
         }
     }
 
-    /// Solves the normal equations of the ground's blocks and the prior. Returns the parameters
+    /// Solves the normal equations of the ground's blocks and the prior again. Returns the parameters
     /// under their limits; None if the equations cannot be solved.
     pub(super) fn solve(&mut self, prior: &Prior) -> Option<Values> {
+        let solution = self.solve_equations(prior);
+        self.variance = self.variances(prior).0;
+        solution
+    }
+
+    fn solve_equations(&mut self, prior: &Prior) -> Option<Values> {
         let cholesky = (self.ground.information + prior.information).cholesky()?;
         self.stiffness_covariance = cholesky.solve(&ln_stiffness_gradient());
-        let solution = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
+        let solution = cholesky.solve(&(self.ground.preferred + prior.preferred));
         let solution = prior.limited(solution, |gradient| cholesky.solve(gradient));
         self.ln_stiffness = solution[index::STIFFNESS];
         Some(solution)
@@ -363,8 +318,8 @@ impl TimeScale {
     }
 
     /// Returns whether the last solution agrees with that of the longer scale `other`.
-    pub(super) fn agrees_with(&self, other: &Self, prior: &Prior) -> bool {
-        let (own, of_other) = (self.variances(prior).0, other.variances(prior).0);
+    pub(super) fn agrees_with(&self, other: &Self) -> bool {
+        let (own, of_other) = (self.variance, other.variance);
         // That of the difference to an efficient estimate is the difference of the variances.
         let variance = (of_other - own).max(DIFFERENCE_MIN * of_other);
         (self.ln_stiffness - other.ln_stiffness).powi(2) <= AGREEMENT_STD_DEVS.powi(2) * variance
@@ -375,7 +330,7 @@ impl TimeScale {
         self.ground.multiply(ratio);
         self.segment.multiply(ratio);
         self.last.multiply(ratio);
-        self.scores *= ratio;
+        multiply(self.scores.as_mut_slice(), ratio);
         self.last_score *= ratio.sqrt();
     }
 
@@ -402,6 +357,11 @@ impl TimeScale {
         let known = (prior.information * stiffness_covariance).dot(&stiffness_covariance);
         let nominal = self.nominal_variance();
         ((self.scattered() + known).max(nominal), known)
+    }
+
+    /// Returns the variance of ln K at the last solution, with the weights that the blocks had then.
+    pub(super) fn variance(&self) -> f64 {
+        self.variance
     }
 
     /// Returns the nominal variance of ln K at the last solution, the diagonal element of C.
@@ -464,7 +424,8 @@ mod tests {
             scale.add(0, &compared);
             scale.end_comparison();
         }
-        scale.end_block(&prior.mean, prior, false);
+        scale.close_block(&prior.mean, false);
+        scale.solve_with_block(&prior.mean, prior);
     }
 
     #[test]
