@@ -8,15 +8,10 @@ payload; K is one of four values, and every third robot has white noise on its w
 of the data sheet and the wheels' places. It ends with 1 if a check does not hold, and with 2 if `logs` fails.
 """
 
-import argparse
-import json
 import math
-import multiprocessing
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -24,17 +19,15 @@ import numpy as np
 import write_logs
 from write_logs import ROBOT, WHEEL_NOISE_RAD_S, Ground
 
+sys.path.append(str(Path(__file__).resolve().parent.parent))
+import logs_runs
+
 STIFFNESSES = (0.7, 1.5, 4.0, 8.0)
 COVERAGE_MIN = 0.9
 """Goal for 95 % intervals on robots that are unlike the estimator's."""
 HALF_WIDTH_MAX = 0.6
 """Half-width over θ above which an interval counts as no estimate."""
 WHEEL_HZ = 50
-LOGS_MAX_S = 600
-
-
-class LogsFailed(Exception):
-    """`logs` printed no result: the seed of the robot, and its output."""
 
 
 def magic_formula(curvature):
@@ -84,17 +77,7 @@ def drive(work):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "drive.mcap")
         write_logs.write_mcap(path, write_logs.messages(samples, WHEEL_HZ, np.random.default_rng([seed, 3]), noise_rad_s))
-        command = [str(program), str(path), "--json"]
-        for name, value in model.items():
-            command += [f"--{name.replace('_', '-')}", str(value)]
-        try:
-            ended = subprocess.run(command, capture_output=True, text=True, timeout=LOGS_MAX_S, check=False)
-        except subprocess.TimeoutExpired as error:
-            raise LogsFailed(f"seed {seed}: no result after {LOGS_MAX_S} s") from error
-    try:
-        theta = json.loads(ended.stdout)["overall"]["theta"]
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise LogsFailed(f"seed {seed}: it ended with {ended.returncode}: {ended.stdout}{ended.stderr}") from error
+        theta = logs_runs.theta_of(program, path, model)
     kind = {"curve": curve.split(",", maxsplit=1)[0], "K": ground.stiffness, "practical_slip": float(ground.practical_slip)}
     return kind | {"noise": noise_rad_s > 0.0, "theta": 1.0 / ground.stiffness, "found": theta}
 
@@ -150,42 +133,11 @@ def markdown(lines):
     return "\n".join(rows)
 
 
-def run_all(work, jobs):
-    """All drives, with progress on standard error."""
-    begin, drives = time.monotonic(), []
-    with multiprocessing.Pool(jobs) as pool:
-        for robot in pool.imap(drive, work):
-            drives.append(robot)
-            if len(drives) % 10 == 0 or len(drives) == len(work):
-                seconds = time.monotonic() - begin
-                print(f"{len(drives)} of {len(work)} recordings, {seconds:.0f} s", file=sys.stderr, flush=True)
-    return drives
-
-
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("logs", type=Path, help="the program `logs`")
-    parser.add_argument("--runs", type=int, default=120, help="robots")
-    parser.add_argument("--seed", type=int, default=1000, help="first seed")
-    parser.add_argument("--jobs", type=int, default=1, help="recordings at once")
-    form = parser.add_mutually_exclusive_group()
-    form.add_argument("--json", action="store_true", help="print one JSON object")
-    form.add_argument("--markdown", action="store_true", help="print Markdown, which is the default")
-    options = parser.parse_args()
-    if not options.logs.is_file():
-        parser.error(f"there is no program `{options.logs}`")
-    work = [(options.logs.resolve(), options.seed + run) for run in range(options.runs)]
-    try:
-        lines = lines_of(run_all(work, options.jobs))
-    except LogsFailed as failure:
-        print(f"population.py: `logs` failed: {failure}", file=sys.stderr)
-        sys.exit(2)
-    checks = checks_of(lines)
-    if options.json:
-        print(json.dumps({"lines": lines, "checks": checks}, ensure_ascii=False))
-    else:
-        print(markdown(lines))
-    sys.exit(0 if all(check["holds"] for check in checks) else 1)
+    options = logs_runs.options_of(__doc__, [("runs", 120, "robots")], seed=1000)
+    work = [(options.logs, options.seed + run) for run in range(options.runs)]
+    lines = lines_of(logs_runs.run_all(drive, work, options.jobs))
+    logs_runs.report(lines, checks_of(lines), markdown(lines), options.json)
 
 
 if __name__ == "__main__":
