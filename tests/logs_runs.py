@@ -35,8 +35,7 @@ def theta_of(program, path, robot, *options):
     except subprocess.TimeoutExpired as error:
         raise LogsFailed(f"{shlex.join(command)}\nno result after {LOGS_MAX_S} s") from error
     try:
-        overall = json.loads(ended.stdout)["overall"]
-        return overall and overall["theta"]
+        return json.loads(ended.stdout)["overall"]["theta"]
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         said = f"it ended with {ended.returncode}, {error!r}\n{ended.stdout}{ended.stderr}"
         raise LogsFailed(f"{shlex.join(command)}\n{said}") from error

@@ -7,6 +7,7 @@ use std::f64::consts::PI;
 
 use common::{LOOP_S, SimRobot};
 use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
+use tread_control::estimation::{Estimator, EstimatorPrior, SensorNoise};
 use tread_control::follower::{Follower, FollowerConfig};
 use tread_control::geometry::{Point, Pose};
 use tread_control::plan::Plan;
@@ -15,21 +16,34 @@ use tread_control::trajectory::{Trajectory, Waypoint, WaypointsSpec};
 #[global_allocator]
 static ALLOCATOR: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
 
+const START: Pose = Pose {
+    x_m: 0.0,
+    y_m: 0.0,
+    heading_rad: PI,
+};
+
 #[test]
 fn a_tick_with_estimator_localisation_law_and_gate_allocates_nothing() {
-    let start = Pose {
-        x_m: 0.0,
-        y_m: 0.0,
-        heading_rad: PI,
-    };
-    let mut robot = SimRobot::new(start, 2.0, 5, true);
+    drive(SimRobot::new(START, 2.0, 5, true));
+}
+
+#[test]
+fn a_tick_of_a_robot_that_is_identified_allocates_nothing() {
+    let mut robot = SimRobot::new(START, 2.0, 5, true);
+    let (noise, prior) = (SensorNoise::default(), EstimatorPrior::default());
+    robot.estimator = Estimator::with_prior(robot.model, noise, prior);
+    drive(robot);
+}
+
+/// Drives a mission, and asserts that its ticks allocate nothing.
+fn drive(mut robot: SimRobot) {
     let points = [(1.0, 1.0), (4.0, 2.0), (6.0, -1.0), (2.0, -2.0)]
         .map(|(x_m, y_m)| Waypoint::from(Point { x_m, y_m }));
     let trajectory = Trajectory::Waypoints(WaypointsSpec {
         points: points.to_vec(),
         speed_m_s: 0.6,
     });
-    let plan = Plan::new(&trajectory, start, &robot.model).unwrap();
+    let plan = Plan::new(&trajectory, START, &robot.model).unwrap();
     let mut follower = Follower::new(plan, robot.model, FollowerConfig::default()).unwrap();
     let mut ticks = 0;
     let mut allocating = 0;

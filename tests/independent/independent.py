@@ -45,7 +45,7 @@ def drive(work):
         raise ArithmeticError(f"{line}, seed {seed}: the simulation diverged")
     make = robots.MAKES[parameters["make"]]
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "drive.mcap")
+        path = Path(folder, f"seed-{seed}.mcap")
         recording.write(path, record, parameters, random)
         intervals = {effort: interval_of(program, path, make, effort) for effort in tables.EFFORTS}
     kept = {key: parameters[key] for key in ("line", "seed", "make", "course", "shape")}

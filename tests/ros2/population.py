@@ -75,7 +75,7 @@ def drive(work):
     samples = write_logs.simulate(np.random.default_rng([seed, 2]), ground)
     model = ROBOT | {"mass_kg": sheet_kg, "yaw_inertia_kg_m2": ROBOT["yaw_inertia_kg_m2"] * sheet_kg / ROBOT["mass_kg"]}
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "drive.mcap")
+        path = Path(folder, f"seed-{seed}.mcap")
         write_logs.write_mcap(path, write_logs.messages(samples, WHEEL_HZ, np.random.default_rng([seed, 3]), noise_rad_s))
         theta = logs_runs.theta_of(program, path, model)
     kind = {"curve": curve.split(",", maxsplit=1)[0], "K": ground.stiffness, "practical_slip": float(ground.practical_slip)}

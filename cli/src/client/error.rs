@@ -367,7 +367,7 @@ impl ClientError {
                 problem.kind,
                 ProblemType::Unavailable | ProblemType::Timeout | ProblemType::TooManyRequests
             ),
-            Self::NotUnderstood { status, .. } => matches!(status.as_u16(), 502..=504),
+            Self::NotUnderstood { status, .. } => matches!(status.as_u16(), 429 | 502..=504),
             Self::Address { .. }
             | Self::ClearText { .. }
             | Self::Authority { .. }

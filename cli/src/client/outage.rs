@@ -10,24 +10,40 @@ use super::ClientError;
 /// standby to take over.
 const OUTAGE_MAX: Duration = Duration::from_mins(1);
 
+/// Interval between two attempts during an outage.
+const RETRY_INTERVAL: Duration = Duration::from_secs(2);
+
 /// Whether the server answers a request that is repeated.
 #[derive(Debug, Default)]
 pub(crate) struct Outage {
+    /// Whether the server has answered before. Until then its address may be wrong.
+    has_answered: bool,
     since: Option<Instant>,
 }
 
 impl Outage {
-    /// Returns the answer to a repeated request; `None` if it failed for a time, so that it is to be
-    /// repeated. `notify` is called when an outage begins and when it is over.
+    /// Returns the answer to a repeated request; `None` if it failed temporarily and is to be repeated.
+    /// `notify` is called when an outage begins and when it is over.
     ///
     /// # Errors
-    /// The request will not succeed if it is repeated, or the outage lasts longer than a minute.
+    /// The request will not succeed if it is repeated, the server has never answered, or the outage
+    /// lasts longer than a minute.
     pub(crate) fn bridge<T>(
         &mut self,
         answer: Result<T, ClientError>,
         notify: impl FnOnce(&str),
     ) -> Result<Option<T>, ClientError> {
         self.bridge_at(Instant::now(), answer, notify)
+    }
+
+    /// Returns the time of the outage so far; `None` if the server has answered the last request.
+    pub(crate) fn duration(&self) -> Option<Duration> {
+        self.since.map(|since| since.elapsed())
+    }
+
+    /// Returns the time until the request is to be repeated: `usual`, and longer during an outage.
+    pub(crate) fn interval(&self, usual: Duration) -> Duration {
+        self.since.map_or(usual, |_| RETRY_INTERVAL)
     }
 
     fn bridge_at<T>(
@@ -38,12 +54,13 @@ impl Outage {
     ) -> Result<Option<T>, ClientError> {
         let error = match answer {
             Ok(answer) => {
+                self.has_answered = true;
                 if self.since.take().is_some() {
                     notify("the server answers again");
                 }
                 return Ok(Some(answer));
             }
-            Err(error) if error.is_temporary() => error,
+            Err(error) if error.is_temporary() && self.has_answered => error,
             Err(error) => return Err(error),
         };
         let Some(since) = self.since else {
@@ -105,6 +122,7 @@ mod tests {
     fn a_long_outage_is_an_error() {
         let begin = Instant::now();
         let mut outage = Outage::default();
+        outage.bridge_at(begin, Ok(()), |_| ()).unwrap();
         let first = outage.bridge_at(begin, unavailable(), |_| ());
         assert!(first.unwrap().is_none());
         let last = outage.bridge_at(begin + OUTAGE_MAX, unavailable(), |_| ());
@@ -119,8 +137,16 @@ mod tests {
             (ProblemType::RobotUnreachable, 503),
         ];
         for (kind, status) in refusals {
-            let bridged = Outage::default().bridge(refusal(kind, status), |_| ());
+            let mut outage = Outage::default();
+            outage.bridge(Ok(()), |_| ()).unwrap();
+            let bridged = outage.bridge(refusal(kind, status), |_| ());
             bridged.expect_err(kind.title());
         }
+    }
+
+    #[test]
+    fn a_server_that_has_never_answered_is_an_error_at_once() {
+        let first = Outage::default().bridge(unavailable(), |_| ());
+        first.unwrap_err();
     }
 }

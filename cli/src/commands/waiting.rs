@@ -133,14 +133,22 @@ pub(super) async fn wait(
             for waited in &waited {
                 waited.bar.abandon();
             }
-            let text = format!(
-                "{left} of {} missions have not ended within {}; they continue, see `tread missions`",
-                waited.len(),
-                format_duration(allowed)
-            );
+            let text = match outage.duration() {
+                None => format!(
+                    "{left} of {} missions have not ended within {}; they continue, see `tread missions`",
+                    waited.len(),
+                    format_duration(allowed)
+                ),
+                Some(silent) => format!(
+                    "{} is over, and the server has not answered for {} s; missions continue without \
+                     it, see `tread missions`",
+                    format_duration(allowed),
+                    silent.as_secs()
+                ),
+            };
             return Err(WaitTimeout(text).into());
         }
-        tokio::time::sleep(POLL_INTERVAL).await;
+        tokio::time::sleep(outage.interval(POLL_INTERVAL)).await;
     }
 }
 

@@ -9,7 +9,7 @@ use tread_api::page::PAGE_LIMIT_DEFAULT;
 use tread_api::webhook::{CreatedWebhook, Delivery, DeliveryState, Webhook, WebhookSettings};
 
 use crate::args::{NamedWebhook, WebhooksAction, WebhooksArguments};
-use crate::client::{Client, ClientError, Outage};
+use crate::client::{Client, ClientError};
 use crate::output::{Output, or_dash, print_note, render, table};
 
 /// Interval between looks at a test that is under way.
@@ -120,11 +120,9 @@ async fn await_attempt(
     id: DeliveryId,
 ) -> anyhow::Result<Delivery> {
     let mut last = None;
-    let mut outage = Outage::default();
     for _ in 0..POLLS_MAX {
         let page = client.webhook_deliveries(webhook.id, PAGE_LIMIT_DEFAULT);
-        let page = outage.bridge(page.await, |_| ())?;
-        let found = page.and_then(|page| page.items.into_iter().find(|one| one.id == id));
+        let found = page.await?.items.into_iter().find(|one| one.id == id);
         match found {
             Some(delivery) if delivery.attempts > 0 => return Ok(delivery),
             found => last = found.or(last),

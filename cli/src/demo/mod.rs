@@ -256,8 +256,10 @@ impl Demo<'_> {
 
     async fn wait_for_robots(&self, processes: &mut Processes) -> anyhow::Result<()> {
         let deadline = Instant::now() + START_WAIT_MAX;
+        let mut outage = Outage::default();
         loop {
-            let present = self.present_robots().await?;
+            let present = outage.bridge(self.present_robots().await, print_note)?;
+            let present = present.unwrap_or_default();
             let is_online = |robot: &&ScenarioRobot| {
                 present.iter().any(|seen| {
                     seen.id == robot.id && seen.link == LinkState::Online && seen.live.is_some()
@@ -358,10 +360,8 @@ impl<'demo> Watch<'demo> {
             () = signals.next() => true,
         };
         self.progress.finish();
-        if is_cut_short {
-            // The last look may be of before, or none.
-            self.poll().await?;
-        }
+        // The last look may be of before, or none.
+        self.poll().await?;
         let report = self.report().await?;
         Ok(Ended {
             report,

@@ -38,6 +38,7 @@ mod curved;
 mod demonstrated_friction;
 mod excitation;
 mod expectation;
+mod frozen_torque;
 mod ground_offsets;
 mod identification;
 mod longitudinal;
@@ -58,6 +59,7 @@ use block::{Block, BlockBuilder, BlockContext, ThetaBound};
 use change::ChangeDetector;
 use excitation::Excitation;
 pub use expectation::{ExpectedAccuracy, expected_accuracy};
+use frozen_torque::FrozenTorque;
 use identification::{Identification, Identified};
 use longitudinal::{LongitudinalFilter, SlipBound};
 use offsets::OffsetKnowledge;
@@ -150,6 +152,7 @@ pub struct Estimator {
     /// Moment balance of the last block, if the block was used.
     turning_before: Option<Row>,
     last_wheels: Option<WheelSpeeds>,
+    frozen_torque: FrozenTorque,
     /// Time of the samples dropped since the last used one, seconds.
     skipped_s: f64,
     jumps_in_a_row: u32,
@@ -199,6 +202,7 @@ impl Estimator {
             are_offsets_due: false,
             turning_before: None,
             last_wheels: None,
+            frozen_torque: FrozenTorque::default(),
             skipped_s: 0.0,
             jumps_in_a_row: 0,
             dropped_samples: 0,
@@ -241,6 +245,8 @@ impl Estimator {
             }
             return UpdateOutcome::default();
         }
+        let radius_m = self.model.wheel_radius_m();
+        let sample = &self.frozen_torque.without(sample, radius_m, dt_s);
         let level = match &self.identification {
             Some(identification) if sample.is_specific_force => {
                 identification.without_gravity(sample)

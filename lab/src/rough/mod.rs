@@ -7,6 +7,7 @@
 
 pub mod bound;
 pub mod curve;
+pub mod disturbance;
 pub mod drive;
 pub mod ground_change;
 pub mod means;

@@ -52,16 +52,18 @@ export default async function setup(project: TestProject): Promise<() => Promise
   }
   const report = (code: number | null, signal: string | null) =>
     console.error(`the demo ended during the tests with ${code ?? signal}; its output:\n${output}`);
-  demo.once('exit', report);
+  demo.once('close', report);
   project.provide('server', server);
   project.provide('token', readFileSync(join(folder, 'admin.token'), 'utf8').trim());
   project.provide('demoPid', demo.pid ?? 0);
   project.provide('chromium', chromium);
   return async () => {
-    demo.off('exit', report);
-    const ended = new Promise((resolve) => demo.once('exit', resolve));
-    demo.kill('SIGINT');
-    await ended;
+    demo.off('close', report);
+    if (demo.exitCode === null && demo.signalCode === null) {
+      const ended = new Promise((resolve) => demo.once('exit', resolve));
+      demo.kill('SIGINT');
+      await ended;
+    }
     rmSync(folder, { recursive: true, force: true });
   };
 }

@@ -8,7 +8,7 @@ pub(super) struct Blocks {
     /// `A = Σ Jᵀ W J`, the information matrix, and `b = Σ (Jᵀ W J p_b + g_b)`, the right side of the
     /// normal equations `A p = b`, with the scores `g_b = Jᵀ W r` at the parameters `p_b` of the blocks.
     pub(super) information: Square,
-    pub(super) preferred: Values,
+    pub(super) information_vector: Values,
     /// Sum of the blocks' weights, each at most 1.
     pub(super) count: f64,
 }
@@ -18,7 +18,7 @@ impl Blocks {
     pub(super) fn none() -> Self {
         Self {
             information: Square::zeros(),
-            preferred: Values::zeros(),
+            information_vector: Values::zeros(),
             count: 0.0,
         }
     }
@@ -26,7 +26,7 @@ impl Blocks {
     /// Multiplies the weights of all blocks.
     pub(super) fn multiply(&mut self, ratio: f64) {
         multiply(self.information.as_mut_slice(), ratio);
-        multiply(self.preferred.as_mut_slice(), ratio);
+        multiply(self.information_vector.as_mut_slice(), ratio);
         self.count *= ratio;
     }
 
@@ -42,7 +42,10 @@ impl Blocks {
             self.information.as_mut_slice(),
             other.information.as_slice(),
         );
-        all(self.preferred.as_mut_slice(), other.preferred.as_slice());
+        all(
+            self.information_vector.as_mut_slice(),
+            other.information_vector.as_slice(),
+        );
         self.count = combine(self.count, other.count);
     }
 

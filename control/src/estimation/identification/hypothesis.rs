@@ -342,8 +342,8 @@ impl Hypothesis {
     }
 
     /// Solves the equations that were deferred at the end of the last block.
-    pub(super) fn finish_block(&mut self, prior: &Prior) {
-        self.scales.finish_block(prior);
+    pub(super) fn solve_deferred(&mut self, prior: &Prior) {
+        self.scales.solve_deferred(prior);
     }
 
     /// Returns the maximum magnitude of the change of ln K at the end of a block. Once the estimate
@@ -428,14 +428,15 @@ impl Hypothesis {
             return None;
         }
         let mut others = ground.information - segment.information + prior.information;
-        let mut information_vector = ground.preferred - segment.preferred + prior.preferred;
+        let mut information_vector =
+            ground.information_vector - segment.information_vector + prior.information_vector;
         // K of the other blocks is marginalised.
         let of_stiffness: Values = others.column(index::STIFFNESS).into();
         let most = of_stiffness[index::STIFFNESS];
         information_vector -= of_stiffness * (information_vector[index::STIFFNESS] / most);
         others.ger(-most.recip(), &of_stiffness, &of_stiffness, 1.0);
         let cholesky = (others + segment.information).cholesky()?;
-        let values = cholesky.solve(&(information_vector + segment.preferred));
+        let values = cholesky.solve(&(information_vector + segment.information_vector));
         let values = prior.limited(values, |gradient| cholesky.solve(gradient));
         let of_stiffness = cholesky.solve(&ln_stiffness_gradient());
         // The segment has too few blocks for a scatter of its own: that of the whole ground is

@@ -354,7 +354,7 @@ impl Identification {
         let square_min = self.weight_square_min();
         if self.compared_s >= 0.5 * COMPARED_S {
             // In another tick than the end of the block, which takes long enough.
-            self.finish_block();
+            self.solve_deferred();
         }
         let speed = sample.body_speed_m_s.map(|value| Measured {
             channel: CHANNELS - 1,
@@ -402,7 +402,6 @@ impl Identification {
     /// Compares the means over [`COMPARED_S`], and ends the block where it is full. Returns whether
     /// the ground has changed.
     fn compare(&mut self, noise: &SensorNoise) -> bool {
-        self.finish_block();
         let torque_n_m = self.model.side_load_n() * self.model.wheel_radius_m();
         let root = self.samples.max(1.0).sqrt();
         let with_model = |sensor: f64, model: f64| (sensor / root).hypot(model);
@@ -510,9 +509,9 @@ impl Identification {
     }
 
     /// Solves what the hypotheses deferred at the end of the last block.
-    fn finish_block(&mut self) {
+    fn solve_deferred(&mut self) {
         for hypothesis in &mut self.hypotheses {
-            hypothesis.finish_block(&self.prior);
+            hypothesis.solve_deferred(&self.prior);
         }
     }
 

@@ -86,7 +86,7 @@ pub(super) struct Prior {
     /// Information matrix, the inverse of the covariance.
     pub(super) information: Square,
     /// Information matrix times mean: the prior's part of the right side of the normal equations.
-    pub(super) preferred: Values,
+    pub(super) information_vector: Values,
     /// Standard deviations of the initial prior, before any measurement. They scale the maximum
     /// step and the range of each parameter.
     pub(super) std_devs: Values,
@@ -106,7 +106,7 @@ impl Prior {
     pub(super) fn set(&mut self, mean: &Values, information: &Square) {
         self.mean = *mean;
         self.information = *information;
-        self.preferred = information * mean;
+        self.information_vector = information * mean;
     }
 
     /// Returns the variance that the prior of the tyres' parameters [`OF_TYRES`] contributes to a
@@ -337,7 +337,7 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
     let mut initial = Prior {
         mean: Values::zeros(),
         information: Square::zeros(),
-        preferred: Values::zeros(),
+        information_vector: Values::zeros(),
         std_devs: Values::zeros(),
         first_mean: Values::zeros(),
     };

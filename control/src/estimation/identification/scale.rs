@@ -122,8 +122,9 @@ pub(super) struct TimeScale {
     /// Nominal covariances of ln K with all parameters: the column of C for ln K, with C as in the
     /// module `hypothesis`.
     pub(super) stiffness_covariance: Values,
-    /// Solution of the normal equations for ln K, and its variance with the weights of then.
+    /// Solution of the normal equations for ln K.
     ln_stiffness: f64,
+    /// Variance of ln K at that solution, with the weights that the blocks had then.
     variance: f64,
 }
 
@@ -254,8 +255,9 @@ impl TimeScale {
             .combine(&self.last, |own, last| (own + last) * keeps);
         let last = &mut self.last;
         std::mem::swap(&mut last.information, &mut self.information);
-        last.preferred = self.score;
-        last.preferred.gemv(1.0, &last.information, values, 1.0);
+        last.information_vector = self.score;
+        last.information_vector
+            .gemv(1.0, &last.information, values, 1.0);
         last.count = 1.0;
         self.ground
             .combine(&self.last, |own, last| own * keeps + last);
@@ -268,7 +270,7 @@ impl TimeScale {
         let solution = self.solve_equations(prior);
         // The score at the solution: where a block begins far from it, as the first ones do,
         // residuals there are due to the wrong parameters, and are no noise.
-        self.last_score = self.last.preferred;
+        self.last_score = self.last.information_vector;
         self.last_score.gemv(
             -1.0,
             &self.last.information,
@@ -303,7 +305,7 @@ impl TimeScale {
     fn solve_equations(&mut self, prior: &Prior) -> Option<Values> {
         let cholesky = (self.ground.information + prior.information).cholesky()?;
         self.stiffness_covariance = cholesky.solve(&ln_stiffness_gradient());
-        let solution = cholesky.solve(&(self.ground.preferred + prior.preferred));
+        let solution = cholesky.solve(&(self.ground.information_vector + prior.information_vector));
         let solution = prior.limited(solution, |gradient| cholesky.solve(gradient));
         self.ln_stiffness = solution[index::STIFFNESS];
         Some(solution)

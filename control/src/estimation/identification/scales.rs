@@ -1,6 +1,6 @@
 //! The normal equations at all time scales, and the choice of one of them.
 //!
-//! Where the shortest scale agrees with the next one, the equations of the longest one are solved
+//! Where the shortest scale agrees with the next one, or that one has no solution, the equations of the longest one are solved
 //! later, when the caller has time for it, because all three solutions together take most of a
 //! tick. Results are the same to the last bit.
 
@@ -19,6 +19,7 @@ pub(super) struct TimeScales {
     /// Whether the last normal equations could be solved at any time scale; otherwise noise of the
     /// wheel speeds dominates the measurements.
     is_determined: bool,
+    /// While there is one, the shortest scale is used.
     deferred: Option<Deferred>,
 }
 
@@ -77,6 +78,7 @@ impl TimeScales {
 
     /// Drops the last block, which may contain samples of two grounds.
     pub(super) fn drop_last_block(&mut self) {
+        debug_assert!(self.deferred.is_none());
         self.scales.iter_mut().for_each(TimeScale::drop_last_block);
     }
 
@@ -98,6 +100,7 @@ impl TimeScales {
 
     /// Takes the blocks of the open segment at the used scale; the ground keeps them.
     pub(super) fn take_segment(&mut self) -> Blocks {
+        debug_assert!(self.deferred.is_none());
         let [first, second, third] = self.scales.each_mut().map(TimeScale::take_segment);
         match self.used {
             0 => first,
@@ -110,14 +113,14 @@ impl TimeScales {
     /// Returns the solution of the scale that is used from now on; None if no scale has one. Once the
     /// estimate `has_converged`, blocks with large residuals get less weight.
     ///
-    /// The caller calls [`Self::finish_block`] before it drops or takes blocks.
+    /// The caller calls [`Self::solve_deferred`] before it drops or takes blocks.
     pub(super) fn end_block(
         &mut self,
         values: &Values,
         prior: &Prior,
         has_converged: bool,
     ) -> Option<Values> {
-        self.finish_block(prior);
+        self.solve_deferred(prior);
         for scale in &mut self.scales {
             scale.close_block(values, has_converged);
         }
@@ -139,7 +142,7 @@ impl TimeScales {
     }
 
     /// Solves the equations that were deferred at the end of the last block.
-    pub(super) fn finish_block(&mut self, prior: &Prior) {
+    pub(super) fn solve_deferred(&mut self, prior: &Prior) {
         if let Some(deferred) = self.deferred.take() {
             let [.., third] = &mut self.scales;
             third.solve_with_block(&deferred.values, prior);
@@ -150,6 +153,7 @@ impl TimeScales {
     /// Solves the normal equations again. Returns the solution of the scale that is used from now
     /// on; None if no scale has one.
     pub(super) fn solve(&mut self, prior: &Prior) -> Option<Values> {
+        debug_assert!(self.deferred.is_none());
         let solutions = self.scales.each_mut().map(|scale| scale.solve(prior));
         self.choose(&solutions)
     }
@@ -210,6 +214,7 @@ mod tests {
             let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
             let (mut at_once, mut late) = (TimeScales::new(), TimeScales::new());
             let mut values = prior.mean;
+            let mut was_deferred = false;
             for (residuals, speed, weight_factor) in blocks {
                 for (turn, residual) in (0_u32..).zip(residuals) {
                     for scales in [&mut at_once, &mut late] {
@@ -218,17 +223,19 @@ mod tests {
                     }
                 }
                 let solution = at_once.end_block(&values, &prior, false);
-                at_once.finish_block(&prior);
+                at_once.solve_deferred(&prior);
                 prop_assert_eq!(late.end_block(&values, &prior, false), solution);
+                was_deferred |= late.deferred.is_some();
                 // The body speed of the next block comes before the solution.
                 for scales in [&mut at_once, &mut late] {
                     scales.scale_weights(weight_factor);
                     scales.add(CHANNELS - 1, &compared(speed, 1.0));
                 }
-                late.finish_block(&prior);
+                late.solve_deferred(&prior);
                 prop_assert_eq!(&late, &at_once);
                 values = solution.unwrap_or(values);
             }
+            prop_assert!(was_deferred);
         }
     }
 }

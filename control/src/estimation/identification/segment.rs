@@ -10,7 +10,7 @@ impl Identification {
     /// Drops the last block of every hypothesis and the open one, which may contain samples of
     /// another ground.
     pub(in super::super) fn drop_last_block(&mut self) {
-        self.finish_block();
+        self.solve_deferred();
         for hypothesis in &mut self.hypotheses {
             hypothesis.drop_last_block(&self.prior);
         }
@@ -30,7 +30,7 @@ impl Identification {
         if self.block_s >= SHORT_BLOCK_S {
             self.end_block();
         }
-        self.finish_block();
+        self.solve_deferred();
         let ground = self.identified();
         let duration_s = std::mem::take(&mut self.segment_s);
         self.last_block_s = 0.0;
