@@ -43,8 +43,9 @@ fn drive(mut robot: SimRobot) {
         points: points.to_vec(),
         speed_m_s: 0.6,
     });
-    let plan = Plan::new(&trajectory, START, &robot.model).unwrap();
-    let mut follower = Follower::new(plan, robot.model, FollowerConfig::default()).unwrap();
+    let plan = Plan::new(&trajectory, START, &robot.model).expect("a plan");
+    let mut follower =
+        Follower::new(plan, robot.model, FollowerConfig::default()).expect("valid gains");
     let mut ticks = 0;
     let mut allocating = 0;
     loop {

@@ -7,6 +7,7 @@
 use super::SensorSample;
 use super::payload::STANDING_M_S;
 use crate::measured::WheelTorques;
+use crate::robot::RobotModel;
 
 /// Time of equal torques from which they are frozen, seconds; longer than the period of drivers that
 /// read torques less often than wheel speeds.
@@ -21,11 +22,11 @@ pub(super) struct FrozenTorque {
 
 impl FrozenTorque {
     /// Returns the sample, taken `time_s` seconds after the one before, without its torques if they
-    /// are frozen and a wheel of this radius turns.
+    /// are frozen and a wheel of the robot turns.
     pub(super) fn without(
         &mut self,
         sample: &SensorSample,
-        wheel_radius_m: f64,
+        model: &RobotModel,
         time_s: f64,
     ) -> SensorSample {
         let gyro_rad_s = sample.gyro_rad_s;
@@ -41,7 +42,7 @@ impl FrozenTorque {
             _ => self.repeated_s = 0.0,
         }
         let wheels = sample.wheel_speeds;
-        let rim_m_s = wheels.left_rad_s.abs().max(wheels.right_rad_s.abs()) * wheel_radius_m;
+        let rim_m_s = wheels.magnitude_max_rad_s() * model.wheel_radius_m();
         let is_frozen = self.repeated_s >= FROZEN_AFTER_S && rim_m_s > STANDING_M_S;
         SensorSample {
             wheel_torques: sample.wheel_torques.filter(|_| !is_frozen),
@@ -75,7 +76,9 @@ mod tests {
                 }),
                 ..SensorSample::default()
             };
-            used = check.without(&sample, 0.1, TIME_S).wheel_torques;
+            used = check
+                .without(&sample, &RobotModel::yi2007(), TIME_S)
+                .wheel_torques;
         }
         used.is_some()
     }

@@ -245,8 +245,7 @@ impl Estimator {
             }
             return UpdateOutcome::default();
         }
-        let radius_m = self.model.wheel_radius_m();
-        let sample = &self.frozen_torque.without(sample, radius_m, dt_s);
+        let sample = &self.frozen_torque.without(sample, &self.model, dt_s);
         let level = match &self.identification {
             Some(identification) if sample.is_specific_force => {
                 identification.without_gravity(sample)
