@@ -412,11 +412,10 @@ fn exit_of(problem: &ProblemBody) -> Exit {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn refused(kind: ProblemType, status: u16) -> ClientError {
-        ClientError::Refused {
+impl ClientError {
+    /// Creates the refusal of a server with this problem.
+    pub(super) fn refused(kind: ProblemType, status: u16) -> Self {
+        Self::Refused {
             problem: Box::new(ProblemBody {
                 kind,
                 title: kind.title().to_owned(),
@@ -428,10 +427,15 @@ mod tests {
             }),
         }
     }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
 
     #[test]
     fn a_refused_token_is_said_without_a_word_of_http() {
-        let mut error = refused(ProblemType::Unauthenticated, 401);
+        let mut error = ClientError::refused(ProblemType::Unauthenticated, 401);
         if let ClientError::Refused { problem } = &mut error {
             problem.detail = Some("send `authorization: Bearer …`".to_owned());
         }
@@ -470,7 +474,7 @@ mod tests {
             (ProblemType::TurnTooSharp, 422, Exit::Refused),
             (ProblemType::RobotUnreachable, 503, Exit::Unreachable),
         ] {
-            let error = refused(kind, status);
+            let error = ClientError::refused(kind, status);
             assert_eq!(error.exit(), exit, "{kind:?}");
             assert!(error.next_step().is_some(), "{kind:?}");
         }

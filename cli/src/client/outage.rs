@@ -81,25 +81,12 @@ impl Outage {
 
 #[cfg(test)]
 mod tests {
-    use tread_api::problem::{ProblemBody, ProblemType};
+    use tread_api::problem::ProblemType;
 
     use super::*;
 
-    fn refusal(kind: ProblemType, status: u16) -> Result<(), ClientError> {
-        let problem = Box::new(ProblemBody {
-            kind,
-            title: kind.title().to_owned(),
-            status,
-            detail: None,
-            field: None,
-            state: None,
-            place: None,
-        });
-        Err(ClientError::Refused { problem })
-    }
-
     fn unavailable() -> Result<(), ClientError> {
-        refusal(ProblemType::Unavailable, 503)
+        Err(ClientError::refused(ProblemType::Unavailable, 503))
     }
 
     #[test]
@@ -139,7 +126,7 @@ mod tests {
         for (kind, status) in refusals {
             let mut outage = Outage::default();
             outage.bridge(Ok(()), |_| ()).unwrap();
-            let bridged = outage.bridge(refusal(kind, status), |_| ());
+            let bridged = outage.bridge(Err::<(), _>(ClientError::refused(kind, status)), |_| ());
             bridged.expect_err(kind.title());
         }
     }
