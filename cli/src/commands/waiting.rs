@@ -60,7 +60,7 @@ impl AwaitedMission {
 }
 
 /// Waits until the missions have ended and returns them in the order of `missions`. A short outage of
-/// the server does not end it, because the missions continue without the server.
+/// the server does not end the wait, because the missions continue without the server.
 ///
 /// # Errors
 /// [`WaitTimeout`] if they have not ended within `allowed`; the missions continue.
