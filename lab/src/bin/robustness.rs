@@ -78,7 +78,7 @@ struct Line {
     over_limit_ticks: usize,
 }
 
-/// The disturbances, with their names; `has_torque` says whether they need wheel torques.
+/// Returns the disturbances with their names.
 fn disturbances() -> Vec<(String, Disturbance)> {
     let mut all = vec![
         ("nothing".to_owned(), Disturbance::None),
@@ -133,8 +133,8 @@ fn disturbances() -> Vec<(String, Disturbance)> {
     all
 }
 
-/// Returns whether a disturbance concerns robots without wheel torques.
-fn is_without_torque(disturbance: Disturbance) -> bool {
+/// Returns whether robots that measure no wheel torques can have this disturbance.
+fn applies_without_torque(disturbance: Disturbance) -> bool {
     !matches!(
         disturbance,
         Disturbance::Channel {
@@ -251,7 +251,7 @@ fn main() -> anyhow::Result<ExitCode> {
             continue;
         }
         lines.push(line(&arguments, named, true)?);
-        if is_without_torque(named.1) {
+        if applies_without_torque(named.1) {
             lines.push(line(&arguments, named, false)?);
         }
     }
