@@ -45,7 +45,7 @@ export default async function setup(project: TestProject): Promise<() => Promise
     stdio: ['ignore', 'pipe', 'pipe'],
   });
   const server = await address(demo);
-  // All tests that follow would fail without a reason.
+  // If the demo ends, all tests that follow fail; its output says why.
   let output = '';
   for (const stream of [demo.stdout, demo.stderr]) {
     stream?.on('data', (chunk: Buffer) => (output = (output + chunk.toString()).slice(-OUTPUT_MAX)));
