@@ -195,6 +195,10 @@ pub struct LiveFriction {
     pub theta_loop: Option<f64>,
     /// θ measured by the estimator in the present cell and terrain; `null` without information.
     pub theta_measured: Option<ThetaEstimate>,
+    /// Why there is no θ, or none whose 95 % interval is narrower than ± 60 %; `null` if there is one, and
+    /// from an older agent.
+    #[serde(default)]
+    pub no_estimate: Option<NoEstimate>,
     /// Whether the recent motion carried information on θ.
     pub excited: bool,
     /// Longitudinal slip of the wheels; `null` while the wheels hardly turn or hardly change their
@@ -205,6 +209,64 @@ pub struct LiveFriction {
     /// exact, before it has driven for some seconds, and from an older agent.
     #[serde(default)]
     pub robot_parameters: Option<RobotParameters>,
+}
+
+/// Why a robot has no estimate of θ, and which manoeuvre would help.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum NoEstimate {
+    /// The equations of motion do not describe what the sensors measure: the ground has changed, a sensor
+    /// is wrong, or the model is.
+    Misfit,
+    /// The robot has not driven for long enough.
+    Short,
+    /// The wheels slip beyond the range in which slip tells friction nearly all the time.
+    Slip,
+    /// The robot rolled straight on nearly all the time.
+    NoTurns,
+    /// Nearly all turns were to one side, so that different wheel radii look like slip.
+    OneSided,
+    /// The speed hardly changed.
+    NoAcceleration,
+    /// It takes more of the same manoeuvres.
+    Uncertain,
+    /// A reason of a newer agent.
+    #[serde(other)]
+    Other,
+}
+
+impl NoEstimate {
+    /// Returns the reason as a phrase.
+    pub fn reason(self) -> &'static str {
+        match self {
+            Self::Misfit => "the equations of motion do not describe what the sensors measure",
+            Self::Short => "the robot has driven too little on this ground",
+            Self::Slip => "the wheels slip beyond the range in which slip tells friction",
+            Self::NoTurns => "the robot rolled straight on nearly all the time",
+            Self::OneSided => "nearly all turns were to one side",
+            Self::NoAcceleration => "the speed hardly changed",
+            Self::Uncertain => "the 95 % interval is still wider than ± 60 %",
+            Self::Other => "for a reason that this program does not know",
+        }
+    }
+
+    /// Returns what would help, as an imperative; `None` for an unknown reason.
+    pub fn help(self) -> Option<&'static str> {
+        match self {
+            Self::Misfit => {
+                Some("wait if the ground has just changed; otherwise run `tread-agent doctor`")
+            }
+            Self::Short => Some("drive for 20 s or more without a break"),
+            Self::Slip => Some("turn in wider arcs, more slowly, and not on the spot"),
+            Self::NoTurns => Some("drive arcs to both sides, as in a figure-8"),
+            Self::OneSided => Some("turn to both sides, as in a figure-8"),
+            Self::NoAcceleration => {
+                Some("accelerate and brake, by half of the speed within three seconds")
+            }
+            Self::Uncertain => Some("drive figure-8s of 2 to 4 m for a minute, at changing speed"),
+            Self::Other => None,
+        }
+    }
 }
 
 /// Parameters of a robot, estimated together with θ while it drives.

@@ -4,9 +4,10 @@ use std::fmt::{self, Display, Formatter, Write as _};
 use std::ops::RangeInclusive;
 
 use serde_json::{Value, json};
+use tread_control::estimation::manoeuvre::ESTIMATE_HALF_WIDTH_MAX_RATIO;
 
 /// Half-width of a 95 % interval of θ over its value above which an answer counts as none.
-pub const WIDE_RATIO: f64 = 0.6;
+pub const WIDE_RATIO: f64 = ESTIMATE_HALF_WIDTH_MAX_RATIO;
 
 /// Returns the median; 0 of nothing.
 pub fn median(values: &mut [f64]) -> f64 {

@@ -41,6 +41,21 @@ fn no_disturbance_leads_beyond_a_limit_or_to_a_confidently_wrong_theta() {
 }
 
 #[test]
+fn ground_that_becomes_slippery_in_a_bend_leaves_no_confidently_wrong_theta() {
+    let disturbance = Disturbance::GroundChange { stiffness: 0.3 };
+    for (has_torque, seeds) in [
+        (false, [1, 2, 7, 8, 10, 13, 19, 20].as_slice()),
+        (true, &[3]),
+    ] {
+        for seed in seeds {
+            let trial = DisturbedTrial::drawn(3_000_000 + seed, has_torque, disturbance);
+            let outcome = run(&trial).expect("a drive");
+            assert!(!outcome.is_confidently_wrong(), "{seed}: {outcome:?}");
+        }
+    }
+}
+
+#[test]
 fn a_robot_without_position_or_wheel_speeds_stops_and_one_without_torque_drives_on() {
     let outcome = |channel| {
         let fault = ChannelFault::Dropped;

@@ -10,6 +10,7 @@ use tread_api::robot::{ALERT_TEXT_MAX, AlertReport, OutboxStatus, Severity};
 use tread_control::consistency::{Consequence, Finding, Findings, Kind, Subject};
 use tread_control::estimation::PayloadChange;
 use tread_control::geometry::Point;
+use tread_control::measured::WheelTorques;
 
 use crate::control_loop::channels::Fault;
 use crate::control_loop::overrun::{Overrun, WINDOW_TICKS};
@@ -43,6 +44,8 @@ pub(crate) struct AlertInputs<'a> {
     pub(crate) surface_change: Option<Comparison>,
     /// The last change of the payload, while it is reported.
     pub(crate) payload_change: Option<PayloadChange>,
+    /// Wheel torques that are frozen.
+    pub(crate) frozen_torque: Option<WheelTorques>,
     /// Position at which the wheels turn without moving the robot.
     pub(crate) dug_in_at: Option<Point>,
     /// Lateness of the loop while the robot is held for it.
@@ -153,10 +156,21 @@ fn sensor_alert(finding: &Finding) -> (&'static str, Severity, String) {
     (code, severity, text)
 }
 
-/// Returns one alert for each code; findings of the same code are joined.
-fn sensor_alerts<'a>(findings: impl IntoIterator<Item = &'a Finding>) -> Vec<AlertReport> {
+/// Returns code, severity and text of frozen wheel torques.
+fn frozen_torque_alert(torques: WheelTorques) -> (&'static str, Severity, String) {
+    let text = format!(
+        "wheel torques frozen: {:.2} N m left and {:.2} N m right to the last bit while the robot drives; θ is estimated without them",
+        torques.left_n_m, torques.right_n_m
+    );
+    ("sensor-frozen", Severity::Warning, text)
+}
+
+/// Returns one alert for each code; those of the same code are joined.
+fn sensor_alerts(
+    found: impl IntoIterator<Item = (&'static str, Severity, String)>,
+) -> Vec<AlertReport> {
     let mut alerts: Vec<AlertReport> = Vec::new();
-    for (code, severity, text) in findings.into_iter().map(sensor_alert) {
+    for (code, severity, text) in found {
         match alerts.iter_mut().find(|known| known.code.as_str() == code) {
             Some(known) => {
                 known.severity = known.severity.max(severity);
@@ -300,7 +314,9 @@ impl Alerts {
         .chain(noticed)
         .flatten()
         .collect();
-        alerts.extend(sensor_alerts(causes.findings.iter()));
+        let findings = causes.findings.iter().map(sensor_alert);
+        let torques = causes.frozen_torque.map(frozen_torque_alert);
+        alerts.extend(sensor_alerts(findings.chain(torques)));
         alerts
     }
 }

@@ -114,6 +114,7 @@ impl Reporter {
             base: self.base.as_deref(),
             surface_change: snapshot.surface_change,
             payload_change: snapshot.payload_change,
+            frozen_torque: snapshot.frozen_torque,
             dug_in_at: snapshot.dug_in_at,
             overrun: snapshot.overrun,
             findings: snapshot.findings,
@@ -222,6 +223,7 @@ impl Reporter {
             friction: LiveFriction {
                 theta_loop: snapshot.theta_loop,
                 theta_measured: snapshot.theta_measured,
+                no_estimate: snapshot.no_estimate,
                 excited: snapshot.excited,
                 slip: snapshot.slip,
                 robot_parameters: snapshot.robot_parameters,

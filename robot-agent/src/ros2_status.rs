@@ -7,6 +7,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use tread_api::friction::NoEstimate;
 use tread_api::ids::MissionId;
 use tread_control::geometry::Pose;
 use tread_ros2::cdr::{Sequence, encode};
@@ -239,6 +240,8 @@ fn estimator(snapshot: &Snapshot) -> Part {
         (Level::Warn, "the ground is not as the map says")
     } else if snapshot.payload_change.is_some() {
         (Level::Warn, "the payload has changed")
+    } else if let Some(why) = snapshot.no_estimate {
+        (Level::Ok, why.reason())
     } else if snapshot.excited {
         (Level::Ok, "learns")
     } else {
@@ -246,11 +249,13 @@ fn estimator(snapshot: &Snapshot) -> Part {
     };
     let number = |value: Option<f64>| value.map_or("unknown".to_owned(), |it| format!("{it:.4}"));
     let measured = snapshot.theta_measured;
+    let help = snapshot.no_estimate.and_then(NoEstimate::help);
     Part {
         name: "tread_agent: estimator",
         level,
         message: message.to_owned(),
         values: vec![
+            ("what would help".to_owned(), help.unwrap_or("-").to_owned()),
             ("theta".to_owned(), number(measured.map(|it| it.theta))),
             (
                 "standard deviation of theta".to_owned(),

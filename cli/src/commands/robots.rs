@@ -205,6 +205,15 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
             age(friction.age_ms)
         )
     }));
+    let no_estimate = live
+        .friction
+        .and_then(|friction| friction.value.no_estimate);
+    lines.extend(no_estimate.map(|why| {
+        let help = why
+            .help()
+            .map_or_else(String::new, |help| format!("; {help}"));
+        format!("no estimate    {}{help}", why.reason())
+    }));
     lines.extend(parameters(live));
     let slip = live.friction.and_then(|friction| friction.value.slip);
     lines.extend(slip.map(|slip| {
@@ -327,5 +336,79 @@ pub(super) fn mode_name(mode: RobotMode) -> &'static str {
         RobotMode::Teleoperated => "teleoperated",
         RobotMode::Stopped => "stopped",
         RobotMode::Fault => "fault",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    /// A robot that says this of friction.
+    fn live(friction: &serde_json::Value) -> RobotLive {
+        let control_loop = json!({
+            "rate_hz": 100.0, "ticks": 9, "overruns": 0, "tick_max_us": 90, "commands_refused": 0,
+            "lost_segments": 0, "unmapped_blocks": 0,
+        });
+        let live = json!({
+            "boot": "0192f0c1-2b3c-7d4e-8f50-000000000001",
+            "state_age_ms": 20,
+            "robot_time": "2026-01-31T14:05:09Z",
+            "clock_offset_ms": 0,
+            "mode": "idle",
+            "fault": null,
+            "pose": null,
+            "twist": null,
+            "mission": null,
+            "friction": { "age_ms": 20, "value": friction },
+            "outbox": { "pending": 0, "dropped": 0, "refused": 0 },
+            "control_loop": control_loop,
+            "battery": null,
+            "safety": SafetyStatus::default(),
+        });
+        serde_json::from_value(live).unwrap()
+    }
+
+    #[test]
+    fn a_robot_without_an_estimate_says_why_and_what_helps() {
+        let lines = |no_estimate: &str| {
+            let friction = json!({
+                "theta_loop": null, "theta_measured": null, "excited": true,
+                "no_estimate": no_estimate,
+            });
+            live_lines(&live(&friction)).join("\n")
+        };
+        let one_sided = lines("one_sided");
+        let said = "no estimate    nearly all turns were to one side; turn to both sides";
+        assert!(one_sided.contains(said), "{one_sided}");
+        let newer = lines("a_reason_of_next_year");
+        assert!(newer.contains("no estimate    for a reason"), "{newer}");
+    }
+
+    #[test]
+    fn parameters_have_intervals_and_say_what_is_mostly_prior() {
+        let estimate = |value: f64, is_prior: bool| json!({ "value": value, "std_dev": 0.1, "prior_dominated": is_prior });
+        let friction = json!({
+            "theta_loop": null,
+            "theta_measured": { "theta": 0.25, "std_dev": 0.01 },
+            "excited": true,
+            "robot_parameters": {
+                "apparent_mass_ratio": estimate(1.2, false),
+                "mass_kg": estimate(20.0, true),
+                "yaw_inertia_ratio": estimate(0.9, false),
+                "center_of_mass_forward_m": estimate(0.01, false),
+                "center_of_mass_left_m": estimate(-0.02, false),
+            },
+        });
+        let lines = live_lines(&live(&friction)).join("\n");
+        for expected in [
+            "apparent mass  1.200 ± 0.196 of the configured",
+            "mass           20.000 ± 0.196 kg (mostly prior)",
+            "centre left    -0.020 ± 0.196 m",
+        ] {
+            assert!(lines.contains(expected), "{lines}");
+        }
+        assert!(!lines.contains("no estimate"), "{lines}");
     }
 }

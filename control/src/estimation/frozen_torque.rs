@@ -18,6 +18,8 @@ const FROZEN_AFTER_S: f64 = 0.5;
 pub(super) struct FrozenTorque {
     last: Option<(WheelTorques, f64)>,
     repeated_s: f64,
+    /// The part of that time in which a wheel turned.
+    driven_s: f64,
 }
 
 impl FrozenTorque {
@@ -30,6 +32,8 @@ impl FrozenTorque {
         time_s: f64,
     ) -> SensorSample {
         let gyro_rad_s = sample.gyro_rad_s;
+        let rim_m_s = sample.wheel_speeds.magnitude_max_rad_s() * model.wheel_radius_m();
+        let is_moving = rim_m_s > STANDING_M_S;
         let now = sample.wheel_torques.map(|torques| (torques, gyro_rad_s));
         let last = std::mem::replace(&mut self.last, now);
         match (now, last) {
@@ -37,17 +41,23 @@ impl FrozenTorque {
                 // A simulation without noise repeats all of its values at a steady state.
                 if gyro_rad_s.to_bits() != turned_rad_s.to_bits() {
                     self.repeated_s += time_s;
+                    self.driven_s += if is_moving { time_s } else { 0.0 };
                 }
             }
-            _ => self.repeated_s = 0.0,
+            _ => (self.repeated_s, self.driven_s) = (0.0, 0.0),
         }
-        let wheels = sample.wheel_speeds;
-        let rim_m_s = wheels.magnitude_max_rad_s() * model.wheel_radius_m();
-        let is_frozen = self.repeated_s >= FROZEN_AFTER_S && rim_m_s > STANDING_M_S;
+        let is_frozen = self.repeated_s >= FROZEN_AFTER_S && is_moving;
         SensorSample {
             wheel_torques: sample.wheel_torques.filter(|_| !is_frozen),
             ..*sample
         }
+    }
+
+    /// Returns the torques that have been the same for half a second of driving; they stay frozen while
+    /// the robot stands, until they change. Torques at rest may well be the same.
+    pub(super) fn frozen(&self) -> Option<WheelTorques> {
+        let (torques, _) = self.last?;
+        (self.driven_s >= FROZEN_AFTER_S).then_some(torques)
     }
 }
 
@@ -95,5 +105,36 @@ mod tests {
         // At rest, and a simulation without noise.
         assert!(is_used(0.0, |_| 0.0, turns));
         assert!(is_used(5.0, |_| 1.3, |_| 0.2));
+    }
+
+    #[test]
+    fn torques_are_reported_frozen_after_half_a_second_of_driving_until_they_change() {
+        let mut check = FrozenTorque::default();
+        let mut tick = 0.0;
+        let mut after = |seconds: f64, rad_s: f64, left_n_m: f64| {
+            let until = tick + seconds;
+            while tick < until {
+                tick += TIME_S;
+                let sample = SensorSample {
+                    wheel_speeds: WheelSpeeds {
+                        left_rad_s: rad_s,
+                        right_rad_s: rad_s,
+                    },
+                    gyro_rad_s: tick,
+                    wheel_torques: Some(WheelTorques {
+                        left_n_m,
+                        right_n_m: 0.0,
+                    }),
+                    ..SensorSample::default()
+                };
+                check.without(&sample, &RobotModel::yi2007(), TIME_S);
+            }
+            check.frozen().map(|torques| torques.left_n_m)
+        };
+        assert_eq!(after(5.0, 0.0, 0.0), None, "it stands");
+        assert_eq!(after(0.3, 5.0, 0.0), None, "not for long enough");
+        assert_eq!(after(0.4, 5.0, 0.0), Some(0.0));
+        assert_eq!(after(5.0, 0.0, 0.0), Some(0.0), "it stands again");
+        assert_eq!(after(0.1, 5.0, 0.7), None);
     }
 }

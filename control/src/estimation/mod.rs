@@ -42,6 +42,7 @@ mod frozen_torque;
 mod ground_offsets;
 mod identification;
 mod longitudinal;
+pub mod manoeuvre;
 mod offsets;
 mod payload;
 mod regression;
@@ -62,6 +63,7 @@ pub use expectation::{ExpectedAccuracy, expected_accuracy};
 use frozen_torque::FrozenTorque;
 use identification::{Identification, Identified};
 use longitudinal::{LongitudinalFilter, SlipBound};
+use manoeuvre::{ESTIMATE_HALF_WIDTH_MAX_RATIO, Manoeuvres, NoEstimate, RimMotion};
 use offsets::OffsetKnowledge;
 use payload::PayloadMonitor;
 use regression::{SharedCovariance, Solution, SolveInput, solve};
@@ -153,6 +155,8 @@ pub struct Estimator {
     turning_before: Option<Row>,
     last_wheels: Option<WheelSpeeds>,
     frozen_torque: FrozenTorque,
+    /// Manoeuvres of the last minutes on this ground.
+    manoeuvres: Manoeuvres,
     /// Time of the samples dropped since the last used one, seconds.
     skipped_s: f64,
     jumps_in_a_row: u32,
@@ -203,6 +207,7 @@ impl Estimator {
             turning_before: None,
             last_wheels: None,
             frozen_torque: FrozenTorque::default(),
+            manoeuvres: Manoeuvres::default(),
             skipped_s: 0.0,
             jumps_in_a_row: 0,
             dropped_samples: 0,
@@ -238,6 +243,7 @@ impl Estimator {
             self.block = BlockBuilder::default();
             self.apparent_mass.interrupt();
             self.payload.interrupt();
+            self.manoeuvres.interrupt();
             self.turning_before = None;
             self.longitudinal = LongitudinalFilter::new();
             if let Some(identification) = &mut self.identification {
@@ -245,6 +251,13 @@ impl Estimator {
             }
             return UpdateOutcome::default();
         }
+        let wheels = sample.wheel_speeds;
+        let radius_m = self.model.wheel_radius_m();
+        let motion = RimMotion {
+            rims_m_s: [wheels.left_rad_s, wheels.right_rad_s].map(|rate| rate * radius_m),
+            turn_rad_s: sample.gyro_rad_s,
+        };
+        self.manoeuvres.add(motion, dt_s);
         let sample = &self.frozen_torque.without(sample, &self.model, dt_s);
         let level = match &self.identification {
             Some(identification) if sample.is_specific_force => {
@@ -287,7 +300,9 @@ impl Estimator {
             theta: self.bound.theta_of_slip(),
         };
         let block = builder.finish(context);
-        if block.is_none() {
+        if block.is_some() {
+            self.manoeuvres.decay(BLOCK_S);
+        } else {
             self.turning_before = None;
         }
         let (of_rows, slips) = block.map_or((false, false), |block| self.add_block(block));
@@ -450,15 +465,28 @@ impl Estimator {
                 most.min(THETA_INITIAL_MAX)
             },
         };
+        let misfit_ratio = self
+            .identification
+            .as_ref()
+            .and_then(|found| found.misfit_ratio());
+        let is_estimate = theta.is_some_and(|found| {
+            NORMAL_95 * found.std_dev <= ESTIMATE_HALF_WIDTH_MAX_RATIO * found.theta
+        });
+        let no_estimate = (!is_estimate).then(|| {
+            if misfit_ratio.is_some() {
+                NoEstimate::Misfit
+            } else {
+                self.manoeuvres.times().lacks(sums.saturation_share())
+            }
+        });
         self.estimate = Estimate {
             theta,
+            no_estimate,
             no_new_information: !self.excitation.is_present(),
             mu_peak_lower_bound: sums.mu_peak(),
             saturation_share: sums.saturation_share(),
-            misfit_ratio: self
-                .identification
-                .as_ref()
-                .and_then(|found| found.misfit_ratio()),
+            misfit_ratio,
+            frozen_torque: self.frozen_torque.frozen(),
             dropped_samples: self.dropped_samples,
             robot: self.identification.as_ref().and_then(|found| found.robot()),
             payload_change: self.payload.change(),
@@ -683,6 +711,7 @@ impl Estimator {
         self.block = BlockBuilder::default();
         self.longitudinal = LongitudinalFilter::new();
         self.excitation = Excitation::default();
+        self.manoeuvres = Manoeuvres::default();
         if let Some(identification) = &mut self.identification {
             identification.begin_ground();
         }

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::manoeuvre::NoEstimate;
 use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 
 /// Errors of the sensors: standard deviations of white noise per sample, unless stated otherwise.
@@ -320,6 +321,8 @@ pub struct PayloadChange {
 pub struct Estimate {
     /// θ of the present ground; `None` without excitation.
     pub theta: Option<ThetaMeasurement>,
+    /// Why there is no θ, or none whose 95 % interval is narrower than ± 60 %; `None` if there is one.
+    pub no_estimate: Option<NoEstimate>,
     /// Whether the motion of about the last two seconds did not excite θ.
     pub no_new_information: bool,
     /// Lower bound of the peak friction coefficient: what several blocks used, for the heaviest
@@ -339,6 +342,9 @@ pub struct Estimate {
     /// deviations, where it is so large that the model does not describe the robot and there is no
     /// θ.
     pub misfit_ratio: Option<f64>,
+    /// Wheel torques that the sensor repeats to the last bit while the robot drives; θ is estimated without
+    /// them.
+    pub frozen_torque: Option<WheelTorques>,
     /// Number of samples dropped because they were not finite or not plausible.
     pub dropped_samples: u64,
     /// The robot's own parameters; `None` if the model counts as exact, and before enough blocks.

@@ -15,16 +15,11 @@ use std::time::Duration;
 use clap::Parser;
 use serde::Serialize;
 use tread_lab::parallel::in_parallel;
-use tread_lab::random::Random;
 use tread_lab::report::{Check, Part, Table, checks_json, page_markdown, percent};
-use tread_lab::rough::disturbance::{Channel, ChannelFault, Disturbance, DisturbedTrial, run};
-use tread_lab::rough::run::Course;
-use tread_lab::rough::sensors::SensorSpec;
-use tread_lab::rough::spec::{Deviations, MAKES};
-use tread_lab::rough::width::Width;
+use tread_lab::rough::disturbance::{
+    CHANGE_FROM, Channel, ChannelFault, Disturbance, DisturbedTrial, run,
+};
 
-/// Mask of the seed for drawing the robot, so that robot and sensor noise are independent.
-const ROBOT_SEED: u64 = 0xd157;
 /// Minimum coverage of the 95 % intervals on each line.
 const COVERAGE_MIN: f64 = 0.9;
 /// Maximum fraction of drives with a confidently wrong estimate.
@@ -35,8 +30,7 @@ const POSITION_LATE: Duration = Duration::from_millis(500);
 /// Durations of a blockage, and of a jump of the position that ends.
 const BLOCKED: Duration = Duration::from_secs(2);
 const JUMPED: Duration = Duration::from_secs(5);
-/// Change of the stiffness K in a bend.
-const CHANGE_FROM: f64 = 5.0;
+/// Stiffness K of the ground that becomes slippery in a bend.
 const CHANGE_TO: f64 = 0.3;
 
 #[derive(Debug, Parser)]
@@ -144,28 +138,6 @@ fn applies_without_torque(disturbance: Disturbance) -> bool {
     )
 }
 
-fn trial(seed: u64, has_torque: bool, disturbance: Disturbance) -> DisturbedTrial {
-    let mut random = Random::new(seed ^ ROBOT_SEED);
-    let courses = [Course::Figure8, Course::Circle];
-    let mut trial = DisturbedTrial {
-        make: random.one_of(&MAKES).unwrap_or(MAKES[0]),
-        deviations: Deviations::drawn(&mut random),
-        sensors: SensorSpec::drawn(&mut random, has_torque),
-        course: random.one_of(&courses).unwrap_or(Course::Figure8),
-        seed,
-        disturbance,
-    };
-    let sensors = trial.sensors;
-    trial.sensors = sensors.with_drawn_inertial_unit(&mut random, Width::default());
-    if let Disturbance::GroundChange { stiffness } = disturbance {
-        let curve = &mut trial.deviations.curve;
-        curve.stiffness = CHANGE_FROM;
-        curve.mu_peak = curve.mu_peak.min(0.9 * stiffness);
-        trial.course = Course::Circle;
-    }
-    trial
-}
-
 fn line(
     arguments: &Arguments,
     (name, disturbance): &(String, Disturbance),
@@ -173,7 +145,7 @@ fn line(
 ) -> anyhow::Result<Line> {
     let seeds = (arguments.seed..).take(arguments.runs as usize);
     let trials: Vec<DisturbedTrial> = seeds
-        .map(|seed| trial(seed, has_torque, *disturbance))
+        .map(|seed| DisturbedTrial::drawn(seed, has_torque, *disturbance))
         .collect();
     let (mut stand, mut estimates, mut covered, mut wrong) = (0, 0, 0, 0);
     let (mut over_limit_drives, mut over_limit_ticks) = (0, 0);

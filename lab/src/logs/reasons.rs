@@ -8,6 +8,7 @@
 use serde::Serialize;
 
 use tread_control::estimation::NORMAL_95;
+use tread_control::estimation::manoeuvre::is_saturated;
 
 use super::estimate::Outcome;
 use super::stretches::{ESTIMATOR_GAP_S, Motion};
@@ -15,15 +16,6 @@ use crate::report::WIDE_RATIO;
 
 /// Share of a time, or of samples, from which a cause counts.
 const SHARE: f64 = 0.2;
-/// Shortest driving in which θ can be found, seconds.
-const DRIVING_MIN_S: f64 = 8.0;
-/// Share of the driving that has to be turns, or acceleration, to count as excitation.
-const EXCITED_SHARE: f64 = 0.08;
-/// Share of a turning robot's turns to the rarer side, below which they count as one-sided.
-const ONE_SIDED_SHARE: f64 = 0.2;
-/// Share of blocks beyond the linear range of slip, above which hardly any is within it. The slope at
-/// zero slip is found from much slip too, but not from much slip alone.
-const SATURATED_SHARE: f64 = 0.9;
 
 /// A reason, with what would help.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -139,14 +131,15 @@ fn of_recording(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
 /// What of the motion leaves θ unknown.
 fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
     let mut reasons = Vec::new();
-    if motion.moving_s < DRIVING_MIN_S {
+    let manoeuvres = &motion.manoeuvres;
+    if manoeuvres.is_too_short() {
         reasons.push(Reason {
             code: "short",
-            reason: format!("the robot drove for {:.1} s only", motion.moving_s),
+            reason: format!("the robot drove for {:.1} s only", manoeuvres.moving_s),
             help: "drive for 20 s or more without a break",
         });
     }
-    if outcome.estimate.saturation_share > SATURATED_SHARE {
+    if is_saturated(outcome.estimate.saturation_share) {
         reasons.push(Reason {
             code: "slip",
             reason: format!(
@@ -156,11 +149,8 @@ fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
             help: "turn in wider arcs, more slowly, and not on the spot",
         });
     }
-    let moving_s = motion.moving_s.max(f64::MIN_POSITIVE);
-    let (left_s, right_s) = (motion.left_s, motion.right_s);
-    let turns = (left_s + right_s) / moving_s;
-    if turns < EXCITED_SHARE {
-        let spot = if motion.on_the_spot_s > EXCITED_SHARE * moving_s {
+    if manoeuvres.has_no_turns() {
+        let spot = if manoeuvres.turns_on_the_spot() {
             ", but for turns on the spot"
         } else {
             ""
@@ -170,7 +160,7 @@ fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
             reason: format!("the robot rolled straight on nearly all the time{spot}"),
             help: "drive arcs to both sides, as in a figure-8",
         });
-    } else if left_s.min(right_s) < ONE_SIDED_SHARE * (left_s + right_s) {
+    } else if manoeuvres.is_one_sided() {
         reasons.push(Reason {
             code: "one_sided",
             reason:
@@ -179,7 +169,7 @@ fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
             help: "turn to both sides, as in a figure-8",
         });
     }
-    if motion.accelerating_s < EXCITED_SHARE * moving_s {
+    if manoeuvres.has_no_acceleration() {
         reasons.push(Reason {
             code: "no_acceleration",
             reason: "the speed hardly changed".to_owned(),
@@ -201,6 +191,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use tread_control::estimation::Estimate;
+    use tread_control::estimation::manoeuvre::ManoeuvreTimes;
 
     use super::*;
 
@@ -215,16 +206,24 @@ mod tests {
         }
     }
 
+    /// The manoeuvres in a minute of figure-8s.
+    fn figure_8s() -> ManoeuvreTimes {
+        ManoeuvreTimes {
+            moving_s: 60.0,
+            left_s: 20.0,
+            right_s: 20.0,
+            accelerating_s: 15.0,
+            ..ManoeuvreTimes::default()
+        }
+    }
+
     /// A minute of figure-8s.
     fn excited() -> Motion {
         Motion {
             duration_s: 60.0,
-            moving_s: 60.0,
+            manoeuvres: figure_8s(),
             samples_hz: 50.0,
             wheel_interval_s: 0.02,
-            left_s: 20.0,
-            right_s: 20.0,
-            accelerating_s: 15.0,
             ..Motion::default()
         }
     }
@@ -247,8 +246,11 @@ mod tests {
         let seldom = Motion {
             wheel_interval_s: 0.2,
             long_interval_ratio: 1.0,
-            left_s: 0.0,
-            right_s: 0.0,
+            manoeuvres: ManoeuvreTimes {
+                left_s: 0.0,
+                right_s: 0.0,
+                ..figure_8s()
+            },
             ..excited()
         };
         assert_eq!(codes(&seldom, &outcome()), ["wheel_rate"]);
@@ -297,18 +299,22 @@ mod tests {
 
     #[test]
     fn each_missing_manoeuvre_is_asked_for() {
-        let straight = Motion {
-            left_s: 1.0,
-            right_s: 1.0,
+        let with = |manoeuvres: ManoeuvreTimes| Motion {
+            manoeuvres,
             ..excited()
         };
+        let straight = with(ManoeuvreTimes {
+            left_s: 1.0,
+            right_s: 1.0,
+            ..figure_8s()
+        });
         assert_eq!(codes(&straight, &outcome()), ["no_turns"]);
-        let circle = Motion {
+        let circle = with(ManoeuvreTimes {
             left_s: 55.0,
             right_s: 0.0,
             accelerating_s: 1.0,
-            ..excited()
-        };
+            ..figure_8s()
+        });
         assert_eq!(codes(&circle, &outcome()), ["one_sided", "no_acceleration"]);
         let slipping = Outcome {
             estimate: Estimate {

@@ -10,6 +10,7 @@ use std::ops::Range;
 use std::time::Duration;
 
 use serde::Serialize;
+use tread_control::estimation::manoeuvre::{MOVING_M_S, ManoeuvreTimes, Manoeuvres, RimMotion};
 use tread_control::robot::RobotModel;
 
 use super::timeline::LoopInput;
@@ -21,18 +22,6 @@ pub const PART_GAP: Duration = Duration::from_secs(1);
 pub const STANDSTILL_MAX: Duration = Duration::from_secs(2);
 /// Shortest drive that is a pass: below it the estimator knows nothing yet.
 pub const PASS_MIN: Duration = Duration::from_secs(8);
-/// Rim speed of the faster side above which the robot moves, metres per second.
-const MOVING_M_S: f64 = 0.05;
-/// Rim speed of the slower side above which the robot rolls rather than turns on the spot, metres
-/// per second.
-const ROLLING_M_S: f64 = 0.1;
-/// Turn rate above which the robot turns, radians per second.
-const TURNING_RAD_S: f64 = 0.15;
-/// Time over which rim speeds are averaged to tell an acceleration, seconds.
-const ACCELERATED_BIN_S: f64 = 0.5;
-/// Change of the mean rim speed over that time, as an acceleration, above which the robot
-/// accelerates, metres per second squared.
-const ACCELERATING_M_S2: f64 = 0.15;
 /// Interval of samples above which the estimator knows nothing of the time between them, seconds.
 pub const ESTIMATOR_GAP_S: f64 = 0.1;
 /// Longest interval of samples whose time counts as driven, seconds.
@@ -43,8 +32,9 @@ const COUNTED_MAX_S: f64 = 0.5;
 pub struct Motion {
     /// Time between the first and the last sample, seconds.
     pub duration_s: f64,
-    /// Time in which the wheels turned, seconds.
-    pub moving_s: f64,
+    /// Times of manoeuvres.
+    #[serde(flatten)]
+    pub manoeuvres: ManoeuvreTimes,
     /// Samples with wheel speeds and yaw rate per second.
     pub samples_hz: f64,
     /// Median interval of wheel speeds, seconds.
@@ -55,14 +45,6 @@ pub struct Motion {
     pub without_gyro_ratio: f64,
     /// Largest rim speed, metres per second.
     pub rim_max_m_s: f64,
-    /// Time of turning to the left while rolling, seconds.
-    pub left_s: f64,
-    /// Time of turning to the right while rolling, seconds.
-    pub right_s: f64,
-    /// Time of turning on the spot, seconds.
-    pub on_the_spot_s: f64,
-    /// Time of accelerating or braking, seconds.
-    pub accelerating_s: f64,
     /// Whether wheel torques were measured.
     pub has_torque: bool,
     /// Whether the acceleration was measured.
@@ -167,8 +149,7 @@ pub fn motion(fed: &[LoopInput], model: &RobotModel) -> Motion {
     let mut motion = Motion::default();
     let (mut intervals_s, mut last_wheels): (Vec<f64>, Option<Duration>) = (Vec::new(), None);
     let (mut wheels, mut wholes) = (0_u64, 0_u64);
-    let mut bin = Bin::default();
-    let mut before_m_s: Option<f64> = None;
+    let mut manoeuvres = Manoeuvres::default();
     for one in fed {
         let Some(rims_m_s) = rims_m_s(one, radius_m) else {
             continue;
@@ -188,32 +169,13 @@ pub fn motion(fed: &[LoopInput], model: &RobotModel) -> Motion {
         wholes += 1;
         let counted_s = dt_s.min(COUNTED_MAX_S);
         motion.rim_max_m_s = motion.rim_max_m_s.max(faster(rims_m_s));
-        if faster(rims_m_s) > MOVING_M_S {
-            motion.moving_s += counted_s;
-        }
-        let is_rolling = rims_m_s[0] * rims_m_s[1] > 0.0
-            && rims_m_s[0].abs().min(rims_m_s[1].abs()) > ROLLING_M_S;
-        if turn_rad_s.abs() > TURNING_RAD_S {
-            let time_s = match (is_rolling, turn_rad_s > 0.0) {
-                (false, _) => &mut motion.on_the_spot_s,
-                (true, true) => &mut motion.left_s,
-                (true, false) => &mut motion.right_s,
-            };
-            *time_s += counted_s;
-        }
-        let driven = Bin {
-            distance_m: 0.5 * (rims_m_s[0] + rims_m_s[1]) * counted_s,
-            time_s: counted_s,
+        let rim_motion = RimMotion {
+            rims_m_s,
+            turn_rad_s,
         };
-        if let Some(mean_m_s) = bin.add(driven) {
-            let change_m_s = before_m_s
-                .replace(mean_m_s)
-                .map_or(0.0, |before| mean_m_s - before);
-            if change_m_s.abs() > ACCELERATING_M_S2 * ACCELERATED_BIN_S {
-                motion.accelerating_s += ACCELERATED_BIN_S;
-            }
-        }
+        manoeuvres.add(rim_motion, counted_s);
     }
+    motion.manoeuvres = manoeuvres.times();
     if let (Some(first), Some(last)) = (fed.first(), fed.last()) {
         motion.duration_s = last.sample.at.saturating_sub(first.sample.at).as_secs_f64();
     }
@@ -230,27 +192,6 @@ pub fn motion(fed: &[LoopInput], model: &RobotModel) -> Motion {
         motion.without_gyro_ratio = (wheels - wholes) as f64 / wheels as f64;
     }
     motion
-}
-
-/// Mean of a rim speed over [`ACCELERATED_BIN_S`].
-#[derive(Debug, Clone, Copy, Default)]
-struct Bin {
-    distance_m: f64,
-    time_s: f64,
-}
-
-impl Bin {
-    /// Adds what was driven; returns the mean if the bin is full, and begins the next.
-    fn add(&mut self, driven: Self) -> Option<f64> {
-        self.distance_m += driven.distance_m;
-        self.time_s += driven.time_s;
-        if self.time_s < ACCELERATED_BIN_S - 1.0e-9 {
-            return None;
-        }
-        let mean_m_s = self.distance_m / self.time_s;
-        *self = Self::default();
-        Some(mean_m_s)
-    }
 }
 
 #[cfg(test)]

@@ -206,7 +206,8 @@ fn sensors_that_contradict_are_alerts_by_code_with_channel_and_both_values() {
         predicted,
         unit: Unit::RadiansPerSecond,
     };
-    let mut alerts = sensor_alerts(&[finding(Subject::Gyro, Kind::Frozen, 0.52, -0.31)]);
+    let frozen = finding(Subject::Gyro, Kind::Frozen, 0.52, -0.31);
+    let mut alerts = sensor_alerts([sensor_alert(&frozen)]);
     let only = alerts.pop().unwrap();
     assert_eq!(only.code.as_str(), "sensor-frozen");
     assert_eq!(only.severity, Severity::Critical);
@@ -214,12 +215,13 @@ fn sensors_that_contradict_are_alerts_by_code_with_channel_and_both_values() {
         only.text,
         "gyro frozen: observed 0.52 rad/s, predicted -0.31 rad/s"
     );
-    let said = sensor_alerts(&[
+    let contradictions = [
         finding(Subject::Odometry, Kind::Inconsistent, 0.9, 0.6),
         finding(Subject::Position, Kind::Jumped, 5.0, 0.0),
         finding(Subject::WheelsAndMotion, Kind::Inconsistent, 0.9, 0.1),
         finding(Subject::LeftWheels, Kind::Locked, 0.0, 6.0),
-    ]);
+    ];
+    let said = sensor_alerts(contradictions.iter().map(sensor_alert));
     assert_eq!(
         codes(&said),
         [
@@ -231,6 +233,20 @@ fn sensors_that_contradict_are_alerts_by_code_with_channel_and_both_values() {
     assert_eq!(said[0].severity, Severity::Critical, "the worse of both");
     assert!(said[0].text.contains("odometry speed") && said[0].text.contains("position jumped"));
     assert_eq!(said[1].severity, Severity::Warning);
+}
+
+#[test]
+fn frozen_wheel_torques_are_a_warning_with_their_values() {
+    let said = Alerts::default().judge(&AlertInputs {
+        frozen_torque: Some(WheelTorques {
+            left_n_m: 1.25,
+            right_n_m: 0.0,
+        }),
+        ..AlertInputs::default()
+    });
+    assert_eq!(codes(&said), ["sensor-frozen"]);
+    assert_eq!(said[0].severity, Severity::Warning);
+    assert!(said[0].text.contains("1.25 N m left"), "{}", said[0].text);
 }
 
 #[test]

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
-use tread_api::friction::{RobotParameters, SideSlip, ThetaEstimate};
+use tread_api::friction::{NoEstimate, RobotParameters, SideSlip, ThetaEstimate};
 use tread_api::ids::MissionId;
 use tread_api::robot::{MissionProgress, RobotMode};
 use tread_api::site::Cell;
@@ -21,6 +21,7 @@ use tread_control::estimation::{PayloadChange, SegmentStatistics};
 use tread_control::follower::FailureReason;
 use tread_control::gate::GateCause;
 use tread_control::geometry::{Point, Pose, Twist};
+use tread_control::measured::WheelTorques;
 use tread_control::plan::Plan;
 use tread_control::reference::Governor;
 
@@ -238,10 +239,14 @@ pub(crate) struct Snapshot {
     pub theta_loop: Option<f64>,
     /// Measured θ of the ground under the robot.
     pub theta_measured: Option<ThetaEstimate>,
+    /// Why there is no θ, or none with a narrow interval.
+    pub no_estimate: Option<NoEstimate>,
     /// Parameters of the robot, estimated together with θ.
     pub robot_parameters: Option<RobotParameters>,
     /// The last change of the payload, while it is reported.
     pub(crate) payload_change: Option<PayloadChange>,
+    /// Wheel torques that are frozen.
+    pub(crate) frozen_torque: Option<WheelTorques>,
     /// Whether recent motion carried information on θ.
     pub excited: bool,
     /// Changes of the ground that the estimator detected since the start.
@@ -286,8 +291,10 @@ impl Default for Snapshot {
             battery: None,
             theta_loop: None,
             theta_measured: None,
+            no_estimate: None,
             robot_parameters: None,
             payload_change: None,
+            frozen_torque: None,
             excited: false,
             ground_changes: 0,
             surface_change: None,

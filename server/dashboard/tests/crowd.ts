@@ -24,7 +24,13 @@ interface Words {
   isMoving: boolean;
 }
 
-function wordsOf(model: Robot, index: number, count: number, kinds: Record<keyof typeof CROWD, number>): Words {
+function wordsOf(
+  model: Robot,
+  index: number,
+  count: number,
+  kinds: Record<keyof typeof CROWD, number>,
+  change: (robot: Robot) => void,
+): Words {
   const robot = structuredClone(model);
   const ends = [kinds.fault, kinds.lost, kinds.stopped, kinds.moving].map((_, kind, all) =>
     all.slice(0, kind + 1).reduce((sum, many) => sum + many, 0),
@@ -47,6 +53,7 @@ function wordsOf(model: Robot, index: number, count: number, kinds: Record<keyof
     linear_m_s: isMoving ? CIRCLE.radius_m * CIRCLE.angular_rad_s : 0,
     angular_rad_s: isMoving ? CIRCLE.angular_rad_s : 0,
   };
+  change(robot);
   return {
     parts: JSON.stringify({ robot }).split(new RegExp(`${X}|${Y}|${HEADING}`)),
     x_m: (index % side) * PLACE_M.x,
@@ -56,14 +63,19 @@ function wordsOf(model: Robot, index: number, count: number, kinds: Record<keyof
   };
 }
 
-/** Puts a crowd in the place of the robots of the stream, before the page is opened. */
-export async function crowd(page: Page, count: number, kinds: Record<keyof typeof CROWD, number> = CROWD): Promise<void> {
+/** Puts a crowd in the place of the robots of the stream, before the page is opened; `change` alters each of its robots. */
+export async function crowd(
+  page: Page,
+  count: number,
+  kinds: Record<keyof typeof CROWD, number> = CROWD,
+  change: (robot: Robot) => void = () => undefined,
+): Promise<void> {
   // The server knows none of them: nothing is behind the sockets that watch them.
   await page.routeWebSocket(/\/drive$/, () => undefined);
   const { items } = await api<{ items: Robot[] }>('/v1/sites/yard/robots');
   const model = items.find((robot) => robot.live?.pose && robot.live.twist);
   if (!model) throw new Error('no robot says where it is');
-  const words = Array.from({ length: count }, (_, index) => wordsOf(model, index, count, kinds));
+  const words = Array.from({ length: count }, (_, index) => wordsOf(model, index, count, kinds, change));
   if (words.some(({ parts }) => parts.length !== 4)) throw new Error('a pose is not where it was looked for');
   await page.addInitScript(
     ({ words, circle: { radius_m, angular_rad_s } }) => {

@@ -14,7 +14,7 @@ use super::simulation::{DELAYED, Simulation, delays_s};
 use crate::robot::RobotModel;
 
 /// Differences of ln K of the other grounds.
-const OFFSETS: [f64; 2] = [-1.0, 1.0];
+const OFFSETS: [f64; 3] = [-1.0, 1.0, -2.3];
 /// Threshold h of the CUSUM, without and with measured torque, and its drift k: squares of standard
 /// deviations. Without torque the robot's parameters are less certain, and residuals by errors of
 /// the model last longer.

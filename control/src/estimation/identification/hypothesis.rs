@@ -186,6 +186,11 @@ impl Hypothesis {
         self.age
     }
 
+    /// Returns whether the estimate had time to converge from its starting value.
+    pub(super) fn has_converged(&self) -> bool {
+        self.age > CONVERGES_BLOCKS
+    }
+
     /// Returns the factor by which the last step multiplied the weights of all blocks.
     #[cfg(test)]
     pub(super) fn weight_factor(&self) -> f64 {
@@ -299,7 +304,7 @@ impl Hypothesis {
         self.fast.end_block();
         self.age = self.age.saturating_add(1);
         self.cost *= COST_DECAY;
-        let has_converged = self.age > CONVERGES_BLOCKS;
+        let has_converged = self.has_converged();
         let Some(solution) = self.scales.end_block(&values, prior, has_converged) else {
             // The same values are used until the equations can be solved.
             return true;

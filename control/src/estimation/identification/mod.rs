@@ -13,6 +13,7 @@ mod blocks;
 mod change;
 mod dual;
 mod fast_changes;
+mod fit;
 mod hypothesis;
 #[cfg(test)]
 mod inertial_tests;
@@ -39,6 +40,7 @@ use crate::measured::BodyAcceleration;
 use crate::robot::RobotModel;
 
 use change::{COMPARED, ChangeMonitor, ChannelComparison, Motion};
+use fit::Fit;
 use hypothesis::{Hypothesis, Measured};
 use model::{CHANNELS, Input, State, gravity_m_s2};
 use parameters::{Prior, index};
@@ -139,6 +141,7 @@ pub(super) struct Identification {
     robot: Option<IdentifiedRobot>,
     is_robot_due: bool,
     change: ChangeMonitor,
+    fit: Fit,
     wheel_noise: WheelNoise,
     /// Whether the last sample had wheel torques.
     has_torque: bool,
@@ -186,6 +189,7 @@ impl Identification {
             robot: None,
             is_robot_due: false,
             change: ChangeMonitor::default(),
+            fit: Fit::new(),
             wheel_noise: WheelNoise::new(),
             has_torque: false,
         };
@@ -198,6 +202,7 @@ impl Identification {
     fn begin(&mut self, state: &State<f64>) {
         self.hypotheses.clear();
         self.change = ChangeMonitor::default();
+        self.fit = Fit::new();
         for start in STARTS {
             self.hypotheses
                 .push(Hypothesis::new(&self.prior, start, *state));
@@ -255,6 +260,7 @@ impl Identification {
         self.pending = None;
         self.wheel_noise.interrupt();
         self.change = ChangeMonitor::default();
+        self.fit.drop_block();
         self.clear_sums();
         self.block_s = 0.0;
         self.is_moving = false;
@@ -426,9 +432,12 @@ impl Identification {
                 if measured_s[channel] < compared_s - 1.0e-6 {
                     continue;
                 }
+                let measured = sums[channel] / compared_s;
                 if is_best {
+                    self.fit
+                        .add(channel, (measured - output.value()) / std_devs[channel]);
                     compared[channel] = Some(ChannelComparison {
-                        measured: sums[channel] / compared_s,
+                        measured,
                         output: output.value(),
                         std_dev: std_devs[channel] * hypothesis.residual_ratio(channel),
                     });
@@ -437,7 +446,7 @@ impl Identification {
                     &output,
                     Measured {
                         channel,
-                        value: sums[channel] / compared_s,
+                        value: measured,
                         std_dev: std_devs[channel],
                         square_min,
                     },
@@ -445,6 +454,7 @@ impl Identification {
             }
             hypothesis.end_comparison();
         }
+        self.fit.end_comparison();
         self.block_s += compared_s;
         self.clear_sums();
         let motion = self.motion();
@@ -488,8 +498,10 @@ impl Identification {
             for hypothesis in &mut self.hypotheses {
                 hypothesis.drop_block();
             }
+            self.fit.drop_block();
             return;
         }
+        self.fit.end_block();
         self.segment_s += block_s;
         self.last_block_s = block_s;
         let prior = &self.prior;
@@ -596,11 +608,12 @@ impl Identification {
     }
 
     /// Returns θ of the present ground: the mean of the hypotheses' ln K weighted by their fit,
-    /// with a variance that contains their disagreement. None before [`BLOCKS_MIN`] blocks, or if
-    /// residuals are too large for the model.
+    /// with a variance that contains their disagreement. None before [`BLOCKS_MIN`] blocks, if
+    /// residuals are too large for the model, or if those of the newest blocks are much larger than before.
     pub(super) fn identified(&self) -> Option<Identified> {
         let best = self.best()?;
-        if best.age() < BLOCKS_MIN || best.worst_square() > SQUARE_MAX || !best.is_determined() {
+        let is_known = best.age() >= BLOCKS_MIN && best.is_determined();
+        if !is_known || self.misfit_ratio().is_some() {
             return None;
         }
         let least = self.least_cost();
@@ -638,10 +651,15 @@ impl Identification {
     }
 
     /// Returns the root mean square of the best hypothesis's standardised residuals in its worst
-    /// channel, where it is too large for an estimate.
+    /// channel where it is too large for an estimate; or that of the last block, relative to the usual
+    /// one, where the newest blocks contradict a converged estimate.
     pub(super) fn misfit_ratio(&self) -> Option<f64> {
-        let square = self.best()?.worst_square();
-        (square > SQUARE_MAX).then(|| square.sqrt())
+        let best = self.best()?;
+        let square = best.worst_square();
+        if square > SQUARE_MAX {
+            return Some(square.sqrt());
+        }
+        self.fit.misfit_ratio().filter(|_| best.has_converged())
     }
 
     /// Returns the newest estimate of the robot's own parameters, of this ground or an earlier one.

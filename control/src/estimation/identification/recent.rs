@@ -17,8 +17,8 @@ pub(super) struct RecentBlocks {
     values: [f64; BLOCKS_MAX],
     count: usize,
     next: usize,
-    median: f64,
-    std_error: f64,
+    /// The same values in ascending order.
+    sorted: [f64; BLOCKS_MAX],
 }
 
 impl RecentBlocks {
@@ -28,8 +28,7 @@ impl RecentBlocks {
             values: [0.0; BLOCKS_MAX],
             count: 0,
             next: 0,
-            median: 0.0,
-            std_error: f64::INFINITY,
+            sorted: [0.0; BLOCKS_MAX],
         }
     }
 
@@ -39,20 +38,27 @@ impl RecentBlocks {
         if !value.is_finite() {
             return;
         }
-        self.values[self.next] = value;
+        let oldest = std::mem::replace(&mut self.values[self.next], value);
         self.next = (self.next + 1) % BLOCKS_MAX;
-        self.count = (self.count + 1).min(BLOCKS_MAX);
-        let known = &self.values[..self.count];
-        self.median = median(known.iter().copied(), self.count);
-        let off = known.iter().map(|value| (value - self.median).abs());
-        let std_dev = NORMAL_MAD * median(off, self.count);
-        #[expect(clippy::cast_precision_loss, reason = "at most 31")]
-        let count = self.count as f64;
-        self.std_error = if self.count > 1 {
-            std_dev * (MEDIAN_VARIANCE / count).sqrt()
-        } else {
-            f64::INFINITY
-        };
+        if self.count == BLOCKS_MAX {
+            let place = self.place(oldest);
+            self.sorted.copy_within(place + 1.., place);
+            self.count -= 1;
+        }
+        let place = self.place(value);
+        self.sorted.copy_within(place..self.count, place + 1);
+        self.sorted[place] = value;
+        self.count += 1;
+    }
+
+    /// Returns the place of a value among the sorted ones.
+    fn place(&self, value: f64) -> usize {
+        self.known()
+            .partition_point(|known| known.total_cmp(&value).is_lt())
+    }
+
+    fn known(&self) -> &[f64] {
+        &self.sorted[..self.count]
     }
 
     /// Returns the number of remembered values, at most 31.
@@ -62,34 +68,88 @@ impl RecentBlocks {
 
     /// Returns the median of the remembered values; None without any.
     pub(super) fn median(&self) -> Option<f64> {
-        (self.count > 0).then_some(self.median)
+        let upper = *self.known().get(self.count / 2)?;
+        Some(if self.count % 2 == 1 {
+            upper
+        } else {
+            0.5 * (self.sorted[self.count / 2 - 1] + upper)
+        })
     }
 
     /// Returns the standard error of that median, from the median absolute deviation; infinite with
     /// less than two values.
     pub(super) fn std_error(&self) -> f64 {
-        self.std_error
+        match self.median() {
+            Some(median) if self.count > 1 => {
+                let std_dev = NORMAL_MAD * self.median_deviation(median);
+                #[expect(clippy::cast_precision_loss, reason = "at most 31")]
+                let count = self.count as f64;
+                std_dev * (MEDIAN_VARIANCE / count).sqrt()
+            }
+            _ => f64::INFINITY,
+        }
     }
-}
 
-/// Returns the median of `count` values, of which there are 1 to [`BLOCKS_MAX`].
-fn median(values: impl Iterator<Item = f64>, count: usize) -> f64 {
-    let mut sorted = [f64::INFINITY; BLOCKS_MAX];
-    for (place, value) in sorted.iter_mut().zip(values) {
-        *place = value;
-    }
-    sorted.sort_unstable_by(f64::total_cmp);
-    let upper = sorted[count / 2];
-    if count % 2 == 1 {
-        upper
-    } else {
-        0.5 * (sorted[count / 2 - 1] + upper)
+    /// Returns the median of the distances of all values from their `median`.
+    fn median_deviation(&self, median: f64) -> f64 {
+        let (mut below, mut above) = self.known().split_at(self.place(median));
+        let (mut last, mut before_last) = (0.0, 0.0);
+        for _ in 0..=self.count / 2 {
+            let under = below.last().map_or(f64::INFINITY, |value| median - value);
+            let over = above.first().map_or(f64::INFINITY, |value| value - median);
+            before_last = last;
+            if under < over {
+                last = under;
+                below = &below[..below.len() - 1];
+            } else {
+                last = over;
+                above = &above[1..];
+            }
+        }
+        if self.count % 2 == 1 {
+            last
+        } else {
+            0.5 * (before_last + last)
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
+
+    /// Median of values in any order.
+    fn median_of(mut values: Vec<f64>) -> f64 {
+        values.sort_by(f64::total_cmp);
+        let middle = values.len() / 2;
+        if values.len() % 2 == 1 {
+            values[middle]
+        } else {
+            0.5 * (values[middle - 1] + values[middle])
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn median_and_error_are_those_of_the_newest_values(
+            values in prop::collection::vec(prop_oneof![-1.0e3..1.0e3, Just(2.0), Just(-0.0)], 2..90),
+        ) {
+            let mut recent = RecentBlocks::new();
+            for value in &values {
+                recent.add(*value);
+            }
+            let newest = &values[values.len().saturating_sub(BLOCKS_MAX)..];
+            let median = median_of(newest.to_vec());
+            prop_assert_eq!(recent.median(), Some(median));
+            prop_assert_eq!(recent.count(), newest.len());
+            let off = newest.iter().map(|value| (value - median).abs()).collect();
+            let count = f64::from(u8::try_from(newest.len()).expect("at most 31"));
+            let error = NORMAL_MAD * median_of(off) * (MEDIAN_VARIANCE / count).sqrt();
+            prop_assert_eq!(recent.std_error().to_bits(), error.to_bits());
+        }
+    }
 
     #[test]
     fn a_value_far_off_moves_the_median_to_a_neighbour_at_most() {

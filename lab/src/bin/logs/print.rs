@@ -73,11 +73,11 @@ fn print_verdict(title: &str, verdict: &Verdict) {
         "{title}: {:.1} to {:.1} s, moving {:.1} s, wheels every {:.0} ms, turning left {:.0} s and right {:.0} s, speed changing {:.0} s",
         verdict.from_s,
         verdict.to_s,
-        motion.moving_s,
+        motion.manoeuvres.moving_s,
         1.0e3 * motion.wheel_interval_s,
-        motion.left_s,
-        motion.right_s,
-        motion.accelerating_s,
+        motion.manoeuvres.left_s,
+        motion.manoeuvres.right_s,
+        motion.manoeuvres.accelerating_s,
     );
     if let Some(theta) = verdict.theta {
         println!(

@@ -99,13 +99,16 @@ fn motion_tells_turns_by_their_side_and_the_rate_of_the_wheels() {
         });
     }
     let found = motion(&fed, &model);
-    assert!((found.left_s - 10.0).abs() < 0.1, "{found:?}");
-    assert!((found.right_s - 10.0).abs() < 0.1, "{found:?}");
-    assert!((found.on_the_spot_s - 10.0).abs() < 0.1, "{found:?}");
-    assert!((found.moving_s - 30.0).abs() < 0.1, "{found:?}");
+    assert!((found.manoeuvres.left_s - 10.0).abs() < 0.1, "{found:?}");
+    assert!((found.manoeuvres.right_s - 10.0).abs() < 0.1, "{found:?}");
+    assert!(
+        (found.manoeuvres.on_the_spot_s - 10.0).abs() < 0.1,
+        "{found:?}"
+    );
+    assert!((found.manoeuvres.moving_s - 30.0).abs() < 0.1, "{found:?}");
     assert!((found.wheel_interval_s - 0.02).abs() < 1.0e-6 && found.long_interval_ratio < 1.0e-9);
     // The speed changes once, where turns on the spot begin.
-    assert!(found.accelerating_s < 1.1, "{found:?}");
+    assert!(found.manoeuvres.accelerating_s < 1.1, "{found:?}");
     let seldom: Vec<LoopInput> = fed.iter().step_by(10).copied().collect();
     let found = motion(&seldom, &model);
     assert!(

@@ -14,7 +14,8 @@ use self::drive::DisturbedDrive;
 use super::drive::RoughDrive;
 use super::run::{Course, SETTLES};
 use super::sensors::SensorSpec;
-use super::spec::{Deviations, Make};
+use super::spec::{Deviations, MAKES, Make};
+use super::width::Width;
 use crate::random::Random;
 use crate::report::WIDE_RATIO;
 
@@ -24,6 +25,10 @@ const DISTURBED_AFTER: Duration = Duration::from_secs(30);
 const OBSERVED: Duration = Duration::from_secs(20);
 /// Time after a change of the ground in which the estimate may be of the old ground.
 const CHANGE_KNOWN_AFTER_S: u64 = 3;
+/// Mask of the seed for drawing the robot, so that robot and sensor noise are independent.
+const ROBOT_SEED: u64 = 0xd157;
+/// Stiffness K of the ground before it changes.
+pub const CHANGE_FROM: f64 = 5.0;
 /// Ticks of the control loop in one second.
 const TICKS_PER_S: u32 = 100;
 /// Laps of the course.
@@ -130,6 +135,32 @@ pub struct DisturbedTrial {
     pub seed: u64,
     /// What disturbs the drive.
     pub disturbance: Disturbance,
+}
+
+impl DisturbedTrial {
+    /// Draws robot, sensors and course of the population. Where the ground changes, the course is a
+    /// circle and K is [`CHANGE_FROM`] before.
+    pub fn drawn(seed: u64, has_torque: bool, disturbance: Disturbance) -> Self {
+        let mut random = Random::new(seed ^ ROBOT_SEED);
+        let courses = [Course::Figure8, Course::Circle];
+        let mut trial = Self {
+            make: random.one_of(&MAKES).unwrap_or(MAKES[0]),
+            deviations: Deviations::drawn(&mut random),
+            sensors: SensorSpec::drawn(&mut random, has_torque),
+            course: random.one_of(&courses).unwrap_or(Course::Figure8),
+            seed,
+            disturbance,
+        };
+        let sensors = trial.sensors;
+        trial.sensors = sensors.with_drawn_inertial_unit(&mut random, Width::default());
+        if let Disturbance::GroundChange { stiffness } = disturbance {
+            let curve = &mut trial.deviations.curve;
+            curve.stiffness = CHANGE_FROM;
+            curve.mu_peak = curve.mu_peak.min(0.9 * stiffness);
+            trial.course = Course::Circle;
+        }
+        trial
+    }
 }
 
 /// Result of a drive from the beginning of its disturbance.

@@ -6,10 +6,10 @@
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use tread_api::friction::{ParameterEstimate, RobotParameters, ThetaEstimate};
+use tread_api::friction::{NoEstimate, ParameterEstimate, RobotParameters, ThetaEstimate};
 use tread_api::robot::RobotMode;
 use tread_control::consistency::Subject;
-use tread_control::estimation::{IdentifiedRobot, IdentifiedValue};
+use tread_control::estimation::{IdentifiedRobot, IdentifiedValue, manoeuvre};
 use tread_control::geometry::{Pose, Twist};
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
@@ -162,8 +162,10 @@ impl Output {
             theta_loop: mission.theta_loop.filter(|theta| theta.is_finite()),
             theta_measured: measured
                 .filter(|theta| theta.theta.is_finite() && theta.std_dev.is_finite()),
+            no_estimate: estimated.estimate.no_estimate.map(no_estimate),
             robot_parameters: estimated.estimate.robot.map(robot_parameters),
             payload_change: estimated.estimate.payload_change,
+            frozen_torque: estimated.estimate.frozen_torque,
             excited: !estimated.estimate.no_new_information,
             ground_changes: estimated.ground_changes,
             surface_change: mission.surface_change,
@@ -233,6 +235,18 @@ fn mode(input: &OutputInput<'_>) -> RobotMode {
         RobotMode::Tracking
     } else {
         RobotMode::Idle
+    }
+}
+
+fn no_estimate(reason: manoeuvre::NoEstimate) -> NoEstimate {
+    match reason {
+        manoeuvre::NoEstimate::Misfit => NoEstimate::Misfit,
+        manoeuvre::NoEstimate::Short => NoEstimate::Short,
+        manoeuvre::NoEstimate::Slip => NoEstimate::Slip,
+        manoeuvre::NoEstimate::NoTurns => NoEstimate::NoTurns,
+        manoeuvre::NoEstimate::OneSided => NoEstimate::OneSided,
+        manoeuvre::NoEstimate::NoAcceleration => NoEstimate::NoAcceleration,
+        manoeuvre::NoEstimate::Uncertain => NoEstimate::Uncertain,
     }
 }
 

@@ -189,6 +189,20 @@ export const fleet: Pick<Texts, Areas> = {
     slip: 'Radschlupf, links und rechts',
     excited: 'reicht, um θ zu messen',
     unexcited: 'zu gering, um θ zu messen',
+    noEstimate: 'Keine Schätzung von θ',
+    noEstimateFor: {
+      misfit:
+        'Die Bewegungsgleichungen beschreiben nicht, was die Sensoren messen. Warten Sie, wenn der Boden eben gewechselt hat; sonst hilft tread-agent doctor.',
+      short: 'Der Roboter ist auf diesem Boden zu wenig gefahren. Fahren Sie 20 s oder länger ohne Pause.',
+      slip: 'Der Schlupf der Räder liegt außerhalb des Bereichs, in dem er etwas über die Reibung sagt. Fahren Sie weitere Bögen, langsamer, und drehen Sie nicht auf der Stelle.',
+      no_turns: 'Der Roboter fuhr fast nur geradeaus. Fahren Sie Bögen nach beiden Seiten, etwa eine Acht.',
+      one_sided: 'Fast alle Bögen gingen nach einer Seite. Fahren Sie nach beiden Seiten, etwa eine Acht.',
+      no_acceleration:
+        'Die Geschwindigkeit änderte sich kaum. Beschleunigen und bremsen Sie um die halbe Geschwindigkeit innerhalb von drei Sekunden.',
+      uncertain:
+        'Das 95-%-Intervall ist noch breiter als ± 60 %. Fahren Sie eine Minute lang Achten von 2 bis 4 m mit wechselnder Geschwindigkeit.',
+      other: 'Aus einem Grund, den diese Seite nicht kennt.',
+    },
     newMission: 'Neue Mission',
     awaitsRelease: (robot: string) =>
       `Der Server wurde aus einer Sicherung wiederhergestellt und weiß nicht, was seitdem geschah: Dieser Roboter bekommt keine Mission, bis er freigegeben ist. Sehen Sie nach seinen Missionen, dann: tread robots release ${robot}`,

@@ -190,6 +190,18 @@ export const fleet = {
     slip: 'Wheel slip, left and right',
     excited: 'enough to measure θ',
     unexcited: 'too little to measure θ',
+    noEstimate: 'No estimate of θ',
+    noEstimateFor: {
+      misfit:
+        'The equations of motion do not describe what the sensors measure. Wait if the ground has just changed; otherwise run tread-agent doctor.',
+      short: 'The robot has driven too little on this ground. Drive for 20 s or more without a break.',
+      slip: 'The wheels slip beyond the range in which slip tells friction. Turn in wider arcs, more slowly, and not on the spot.',
+      no_turns: 'The robot rolled straight on nearly all the time. Drive arcs to both sides, as in a figure-8.',
+      one_sided: 'Nearly all turns were to one side. Turn to both sides, as in a figure-8.',
+      no_acceleration: 'The speed hardly changed. Accelerate and brake, by half of the speed within three seconds.',
+      uncertain: 'The 95 % interval is still wider than ± 60 %. Drive figure-8s of 2 to 4 m for a minute, at changing speed.',
+      other: 'For a reason that this page does not know.',
+    } as const,
     newMission: 'New mission',
     awaitsRelease: (robot: string) =>
       `The server was restored from a backup and does not know what happened since: no mission is sent to this robot until it is released. Look at its missions, then: tread robots release ${robot}`,
