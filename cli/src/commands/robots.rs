@@ -192,6 +192,17 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
             fixed(mission.cross_track_m, 3)
         )
     }));
+    lines.push(format!(
+        "outbox         {} waiting, {} dropped, {} refused",
+        live.outbox.pending, live.outbox.dropped, live.outbox.refused
+    ));
+    lines.push(format!(
+        "control loop   {} Hz, {} ticks, {} late, longest {} us",
+        live.control_loop.rate_hz,
+        live.control_loop.ticks,
+        live.control_loop.overruns,
+        live.control_loop.tick_max_us
+    ));
     lines.extend(live.friction.map(|friction| {
         let excited = if friction.value.excited {
             "excited"
@@ -223,17 +234,6 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
             fixed(1e2 * slip.right_ratio, 1)
         )
     }));
-    lines.push(format!(
-        "outbox         {} waiting, {} dropped, {} refused",
-        live.outbox.pending, live.outbox.dropped, live.outbox.refused
-    ));
-    lines.push(format!(
-        "control loop   {} Hz, {} ticks, {} late, longest {} us",
-        live.control_loop.rate_hz,
-        live.control_loop.ticks,
-        live.control_loop.overruns,
-        live.control_loop.tick_max_us
-    ));
     lines
 }
 

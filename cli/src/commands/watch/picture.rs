@@ -67,7 +67,11 @@ pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
             .saturating_sub(MISSION_ROWS_LEAST + alert_rows + 4);
         Constraint::Length(rows(known.robots().count(), most.max(3) - 2))
     };
-    let below = rows(missions.len(), MISSION_ROWS).min(MISSION_ROWS_LEAST);
+    let below = if shown.details {
+        0
+    } else {
+        rows(missions.len(), MISSION_ROWS).min(MISSION_ROWS_LEAST)
+    };
     let [
         heading,
         robots_area,
@@ -87,8 +91,17 @@ pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
     frame.render_widget(Paragraph::new(head(picture)), heading);
     match shown.robot(known).filter(|_| shown.details) {
         Some(robot) => {
-            let block = framed(format!(" {} ", robot.id), true);
-            let text = Paragraph::new(details(robot)).wrap(Wrap { trim: false });
+            let details = details(robot);
+            // The border takes two rows.
+            let is_cut = details.lines().count() + 2 > usize::from(robots_area.height);
+            let id = &robot.id;
+            let title = if is_cut {
+                format!(" {id}: more with `tread robots {id}` ")
+            } else {
+                format!(" {id} ")
+            };
+            let block = framed(title, true);
+            let text = Paragraph::new(details).wrap(Wrap { trim: false });
             frame.render_widget(text.block(block), robots_area);
         }
         None => draw_robots(frame, robots_area, picture),
