@@ -76,7 +76,20 @@ impl RecentBlocks {
         })
     }
 
-    /// Returns the standard error of that median, from the median absolute deviation; infinite with
+    /// Returns the smallest remembered value that at least this share of all values, 0 to 1, does not exceed;
+    /// None without any.
+    pub(super) fn quantile(&self, share: f64) -> Option<f64> {
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            clippy::cast_precision_loss,
+            reason = "at most 31"
+        )]
+        let rank = (share * self.count as f64).ceil() as usize;
+        self.known().get(rank.saturating_sub(1)).copied()
+    }
+
+    /// Returns the standard error of the median, from the median absolute deviation; infinite with
     /// less than two values.
     pub(super) fn std_error(&self) -> f64 {
         match self.median() {
@@ -163,6 +176,17 @@ mod tests {
         assert_eq!(recent.median(), Some(3.0));
         recent.add(f64::NAN);
         assert_eq!((recent.median(), recent.count()), (Some(3.0), 5));
+    }
+
+    #[test]
+    fn a_quantile_is_the_value_that_this_share_does_not_exceed() {
+        let mut recent = RecentBlocks::new();
+        assert_eq!(recent.quantile(0.8), None);
+        for value in [4.0, 1.0, 5.0, 3.0, 2.0] {
+            recent.add(value);
+        }
+        let found = [0.0, 0.2, 0.21, 0.8, 1.0].map(|share| recent.quantile(share));
+        assert_eq!(found, [1.0, 1.0, 2.0, 4.0, 5.0].map(Some));
     }
 
     #[test]
