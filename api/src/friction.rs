@@ -220,15 +220,15 @@ pub enum NoEstimate {
     Misfit,
     /// The robot has not driven for long enough.
     Short,
-    /// The wheels slip beyond the range in which slip tells friction nearly all the time.
+    /// The wheels slip beyond the range in which friction follows from slip nearly all the time.
     Slip,
-    /// The robot rolled straight on nearly all the time.
+    /// The robot drove hardly any arcs: it rolled straight on, or turned on the spot.
     NoTurns,
     /// Nearly all turns were to one side, so that different wheel radii look like slip.
     OneSided,
     /// The speed hardly changed.
     NoAcceleration,
-    /// It takes more of the same manoeuvres.
+    /// The manoeuvres so far do not suffice.
     Uncertain,
     /// A reason of a newer agent.
     #[serde(other)]
@@ -241,11 +241,11 @@ impl NoEstimate {
         match self {
             Self::Misfit => "the equations of motion do not describe what the sensors measure",
             Self::Short => "the robot has driven too little on this ground",
-            Self::Slip => "the wheels slip beyond the range in which slip tells friction",
-            Self::NoTurns => "the robot rolled straight on nearly all the time",
+            Self::Slip => "the wheels slip beyond the range in which friction follows from slip",
+            Self::NoTurns => "the robot drove hardly any arcs",
             Self::OneSided => "nearly all turns were to one side",
             Self::NoAcceleration => "the speed hardly changed",
-            Self::Uncertain => "the 95 % interval is still wider than ± 60 %",
+            Self::Uncertain => "the manoeuvres so far do not suffice",
             Self::Other => "for a reason that this program does not know",
         }
     }
@@ -253,15 +253,15 @@ impl NoEstimate {
     /// Returns what would help, as an imperative; `None` for an unknown reason.
     pub fn help(self) -> Option<&'static str> {
         match self {
-            Self::Misfit => {
-                Some("wait if the ground has just changed; otherwise run `tread-agent doctor`")
-            }
+            Self::Misfit => Some(
+                "drive on for some seconds if the ground has just changed; otherwise run `tread-agent doctor`",
+            ),
             Self::Short => Some("drive for 20 s or more without a break"),
             Self::Slip => Some("turn in wider arcs, more slowly, and not on the spot"),
             Self::NoTurns => Some("drive arcs to both sides, as in a figure-8"),
             Self::OneSided => Some("turn to both sides, as in a figure-8"),
             Self::NoAcceleration => {
-                Some("accelerate and brake, by half of the speed within three seconds")
+                Some("change the speed by half within three seconds, several times")
             }
             Self::Uncertain => Some("drive figure-8s of 2 to 4 m for a minute, at changing speed"),
             Self::Other => None,

@@ -43,6 +43,7 @@ fn no_disturbance_leads_beyond_a_limit_or_to_a_confidently_wrong_theta() {
 #[test]
 fn ground_that_becomes_slippery_in_a_bend_leaves_no_confidently_wrong_theta() {
     let disturbance = Disturbance::GroundChange { stiffness: 0.3 };
+    let mut estimates = 0;
     for (has_torque, seeds) in [
         (false, [1, 2, 7, 8, 10, 13, 19, 20].as_slice()),
         (true, &[3]),
@@ -51,8 +52,10 @@ fn ground_that_becomes_slippery_in_a_bend_leaves_no_confidently_wrong_theta() {
             let trial = DisturbedTrial::drawn(3_000_000 + seed, has_torque, disturbance);
             let outcome = run(&trial).expect("a drive");
             assert!(!outcome.is_confidently_wrong(), "{seed}: {outcome:?}");
+            estimates += outcome.estimates;
         }
     }
+    assert!(estimates > 9, "{estimates} of nine drives");
 }
 
 #[test]

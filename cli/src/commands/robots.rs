@@ -110,6 +110,7 @@ pub(super) fn list(robots: &[Robot]) -> String {
     render(&table)
 }
 
+/// Returns all about a robot, a line for each thing, the less important ones last.
 pub(super) fn details(robot: &Robot) -> String {
     let mut lines = vec![
         format!("robot          {} of site {}", robot.id, robot.site),
@@ -146,6 +147,8 @@ pub(super) fn details(robot: &Robot) -> String {
         let severity = alert.severity.as_str();
         format!("alert          {severity}: {}", alert.text)
     }));
+    // Last, since a small terminal shows the first lines.
+    lines.extend(robot.live.iter().flat_map(friction_lines));
     lines.join("\n")
 }
 
@@ -203,6 +206,12 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
         live.control_loop.overruns,
         live.control_loop.tick_max_us
     ));
+    lines
+}
+
+/// Returns lines about the ground under a robot, and about the robot's parameters.
+fn friction_lines(live: &RobotLive) -> Vec<String> {
+    let mut lines = Vec::new();
     lines.extend(live.friction.map(|friction| {
         let excited = if friction.value.excited {
             "excited"
@@ -377,7 +386,7 @@ mod tests {
                 "theta_loop": null, "theta_measured": null, "excited": true,
                 "no_estimate": no_estimate,
             });
-            live_lines(&live(&friction)).join("\n")
+            friction_lines(&live(&friction)).join("\n")
         };
         let one_sided = lines("one_sided");
         let said = "no estimate    nearly all turns were to one side; turn to both sides";
@@ -401,7 +410,7 @@ mod tests {
                 "center_of_mass_left_m": estimate(-0.02, false),
             },
         });
-        let lines = live_lines(&live(&friction)).join("\n");
+        let lines = friction_lines(&live(&friction)).join("\n");
         for expected in [
             "apparent mass  1.200 ± 0.196 of the configured",
             "mass           20.000 ± 0.196 kg (mostly prior)",

@@ -39,9 +39,9 @@ pub enum NoEstimate {
     Misfit,
     /// The robot has not driven for long enough.
     Short,
-    /// The wheels slip beyond the range in which slip tells friction nearly all the time.
+    /// The wheels slip beyond the range in which friction follows from slip nearly all the time.
     Slip,
-    /// The robot rolls straight on.
+    /// The robot drives hardly any arcs: it rolls straight on, or turns on the spot.
     NoTurns,
     /// Nearly all turns are to one side, so that different wheel radii look like slip.
     OneSided,
@@ -72,7 +72,7 @@ impl ManoeuvreTimes {
         self.moving_s < DRIVING_MIN_S
     }
 
-    /// Returns whether the robot rolled straight on nearly all the time.
+    /// Returns whether the robot drove hardly any arcs.
     pub fn has_no_turns(&self) -> bool {
         self.left_s + self.right_s < EXCITED_SHARE * self.moving_s
     }
@@ -145,6 +145,8 @@ pub struct Manoeuvres {
     open: (f64, f64),
     /// The mean before, metres per second.
     before_m_s: Option<f64>,
+    /// Time in which the wheels turned since the last decay, seconds.
+    moved_s: f64,
 }
 
 impl Manoeuvres {
@@ -162,6 +164,7 @@ impl Manoeuvres {
         let [left, right] = rims_m_s.map(f64::abs);
         if left.max(right) > MOVING_M_S {
             self.times.moving_s += time_s;
+            self.moved_s += time_s;
         }
         let is_rolling = rims_m_s[0] * rims_m_s[1] > 0.0 && left.min(right) > ROLLING_M_S;
         if turn_rad_s.abs() > TURNING_RAD_S {
@@ -186,9 +189,10 @@ impl Manoeuvres {
         }
     }
 
-    /// Reduces the times of old manoeuvres, `time_s` seconds of driving later.
-    pub(super) fn decay(&mut self, time_s: f64) {
-        let kept = (-time_s / REMEMBERED.as_secs_f64()).exp();
+    /// Reduces the times of old manoeuvres by the driving since the last call.
+    pub(super) fn decay(&mut self) {
+        let moved_s = std::mem::take(&mut self.moved_s);
+        let kept = (-moved_s / REMEMBERED.as_secs_f64()).exp();
         for time_s in self.times.times() {
             *time_s *= kept;
         }
@@ -255,6 +259,24 @@ mod tests {
     }
 
     #[test]
+    fn long_turns_on_the_spot_do_not_hide_the_arcs_that_follow() {
+        let mut manoeuvres = Manoeuvres::default();
+        let mut drive = |rims_m_s, turn_rad_s, time_s: u32| {
+            for _ in 0..time_s * 50 {
+                let motion = RimMotion {
+                    rims_m_s,
+                    turn_rad_s,
+                };
+                manoeuvres.add(motion, SAMPLE_S);
+                manoeuvres.decay();
+            }
+            manoeuvres.times().has_no_turns()
+        };
+        assert!(drive([-0.1, 0.1], 0.4, 600));
+        assert!(!drive([0.4, 0.6], 0.5, 30));
+    }
+
+    #[test]
     fn manoeuvres_of_several_minutes_ago_no_longer_count() {
         let mut manoeuvres = Manoeuvres::default();
         let mut drive = |turn_rad_s: f64, time_s: u32| {
@@ -265,7 +287,7 @@ mod tests {
                     turn_rad_s,
                 };
                 manoeuvres.add(motion, SAMPLE_S);
-                manoeuvres.decay(SAMPLE_S);
+                manoeuvres.decay();
             }
             manoeuvres.times().has_no_turns()
         };

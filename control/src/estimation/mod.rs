@@ -300,11 +300,10 @@ impl Estimator {
             theta: self.bound.theta_of_slip(),
         };
         let block = builder.finish(context);
-        if block.is_some() {
-            self.manoeuvres.decay(BLOCK_S);
-        } else {
+        if block.is_none() {
             self.turning_before = None;
         }
+        self.manoeuvres.decay();
         let (of_rows, slips) = block.map_or((false, false), |block| self.add_block(block));
         self.excitation.end_block();
         let solution = self.refresh_theta();
@@ -465,15 +464,14 @@ impl Estimator {
                 most.min(THETA_INITIAL_MAX)
             },
         };
-        let misfit_ratio = self
-            .identification
-            .as_ref()
-            .and_then(|found| found.misfit_ratio());
+        let identification = self.identification.as_ref();
+        let misfit_ratio = identification.and_then(|found| found.misfit_ratio());
+        let newest_misfit_ratio = identification.and_then(|found| found.newest_misfit_ratio());
         let is_estimate = theta.is_some_and(|found| {
             NORMAL_95 * found.std_dev <= ESTIMATE_HALF_WIDTH_MAX_RATIO * found.theta
         });
         let no_estimate = (!is_estimate).then(|| {
-            if misfit_ratio.is_some() {
+            if misfit_ratio.or(newest_misfit_ratio).is_some() {
                 NoEstimate::Misfit
             } else {
                 self.manoeuvres.times().lacks(sums.saturation_share())
@@ -486,6 +484,7 @@ impl Estimator {
             mu_peak_lower_bound: sums.mu_peak(),
             saturation_share: sums.saturation_share(),
             misfit_ratio,
+            newest_misfit_ratio,
             frozen_torque: self.frozen_torque.frozen(),
             dropped_samples: self.dropped_samples,
             robot: self.identification.as_ref().and_then(|found| found.robot()),
@@ -521,6 +520,7 @@ impl Estimator {
     /// Restarts the estimation of mass and inertia after a change of the payload.
     fn begin_load(&mut self) {
         self.apparent_mass = ApparentMass::default();
+        self.manoeuvres = Manoeuvres::default();
         if let Some(identification) = &mut self.identification {
             identification.begin_load();
         }

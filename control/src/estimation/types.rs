@@ -342,6 +342,9 @@ pub struct Estimate {
     /// deviations, where it is so large that the model does not describe the robot and there is no
     /// θ.
     pub misfit_ratio: Option<f64>,
+    /// Factor by which residuals of the newest seconds exceed those before, where they contradict the
+    /// estimate so much that there is no θ.
+    pub newest_misfit_ratio: Option<f64>,
     /// Wheel torques that the sensor repeats to the last bit while the robot drives; θ is estimated without
     /// them.
     pub frozen_torque: Option<WheelTorques>,

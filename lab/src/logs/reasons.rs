@@ -125,6 +125,15 @@ fn of_recording(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
             help: "check mass, wheel radius and track width, the joints' signs, the inertial unit's mounting and orientation, and that all sensors have one clock",
         });
     }
+    if let Some(ratio) = outcome.estimate.newest_misfit_ratio {
+        reasons.push(Reason {
+            code: "misfit",
+            reason: format!(
+                "the last seconds contradict the estimate: residuals are {ratio:.1} times those before"
+            ),
+            help: "look for a change of the ground, or a sensor that failed; estimates from before are under `passes`",
+        });
+    }
     reasons
 }
 
@@ -143,7 +152,7 @@ fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
         reasons.push(Reason {
             code: "slip",
             reason: format!(
-                "the wheels slip beyond the range in which slip tells friction in {} of the time",
+                "the wheels slip beyond the range in which friction follows from slip in {} of the time",
                 percent(outcome.estimate.saturation_share)
             ),
             help: "turn in wider arcs, more slowly, and not on the spot",
@@ -173,7 +182,7 @@ fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
         reasons.push(Reason {
             code: "no_acceleration",
             reason: "the speed hardly changed".to_owned(),
-            help: "accelerate and brake, by half of the speed within three seconds",
+            help: "change the speed by half within three seconds, several times",
         });
     }
     if outcome.estimate.no_new_information {
@@ -280,6 +289,23 @@ mod tests {
         assert_eq!(found.len(), 1, "{found:?}");
         assert!(
             found[0].code == "misfit" && found[0].reason.contains("7 times"),
+            "{found:?}"
+        );
+    }
+
+    #[test]
+    fn last_seconds_that_contradict_the_estimate_are_the_reason() {
+        let changed = Outcome {
+            estimate: Estimate {
+                newest_misfit_ratio: Some(3.2),
+                ..Estimate::default()
+            },
+            ..outcome()
+        };
+        let found = reasons(&excited(), &changed);
+        assert_eq!(found.len(), 1, "{found:?}");
+        assert!(
+            found[0].reason.contains("3.2 times those before"),
             "{found:?}"
         );
     }

@@ -57,7 +57,8 @@ pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
     } else {
         rows(alerts.len(), ALERT_ROWS)
     };
-    let above = if shown.details {
+    let opened = shown.robot(known).filter(|_| shown.details);
+    let above = if opened.is_some() {
         // Details of one robot; missions get the remaining rows.
         Constraint::Length(DETAIL_ROWS)
     } else {
@@ -67,7 +68,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
             .saturating_sub(MISSION_ROWS_LEAST + alert_rows + 4);
         Constraint::Length(rows(known.robots().count(), most.max(3) - 2))
     };
-    let below = if shown.details {
+    let below = if opened.is_some() {
         0
     } else {
         rows(missions.len(), MISSION_ROWS).min(MISSION_ROWS_LEAST)
@@ -89,11 +90,15 @@ pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
     ])
     .areas(frame.area());
     frame.render_widget(Paragraph::new(head(picture)), heading);
-    match shown.robot(known).filter(|_| shown.details) {
+    match opened {
         Some(robot) => {
             let details = details(robot);
-            // The border takes two rows.
-            let is_cut = details.lines().count() + 2 > usize::from(robots_area.height);
+            let width = usize::from(robots_area.width).max(1);
+            let rows = details
+                .lines()
+                .map(|line| Line::raw(line).width().div_ceil(width).max(1));
+            // The title takes a row.
+            let is_cut = rows.sum::<usize>() + 1 > usize::from(robots_area.height);
             let id = &robot.id;
             let title = if is_cut {
                 format!(" {id}: more with `tread robots {id}` ")
@@ -393,89 +398,4 @@ fn draw_table<'row>(
 }
 
 #[cfg(test)]
-mod tests {
-    use ratatui::Terminal;
-    use ratatui::backend::TestBackend;
-    use serde_json::json;
-    use tread_api::event::Event;
-
-    use super::*;
-
-    /// A robot as an older or newer server sends it.
-    fn robot(id: &str, link: &str) -> Event {
-        let at = "2026-11-21T08:00:00Z";
-        let limits = json!({
-            "linear_max_m_s": 1.0, "angular_max_rad_s": 1.0, "linear_acceleration_max_m_s2": 1.0,
-            "lateral_acceleration_max_m_s2": 1.0, "linear_jerk_max_m_s3": 1.0,
-            "wheel_speed_max_rad_s": 1.0, "wheel_acceleration_max_rad_s2": 1.0,
-        });
-        let robot = json!({"robot": {
-            "id": id, "name": id, "retired_at": null, "site": "yard",
-            "model": {
-                "name": "model", "tyres": "tyres", "mass_kg": 1.0, "track_width_m": 1.0,
-                "wheelbase_m": 1.0, "wheel_radius_m": 1.0, "yaw_inertia_kg_m2": 1.0,
-                "limits": limits,
-            },
-            "configuration": "0192f0c1-2b3c-7d4e-8f50-617283940a1b",
-            "capabilities": {"wheel_torque": false, "yaw_rate": false, "teleop": false},
-            "agent_version": "1", "first_seen_at": at, "last_hello_at": at,
-            "measurements": {"refused": 0, "refusal_reason": null, "deferred": 0},
-            "link": link, "link_cause": null, "alerts": [], "live": null,
-        }});
-        serde_json::from_value(robot).expect("a robot")
-    }
-
-    fn picture(known: &SiteState, width: u16, height: u16) -> String {
-        let mut terminal = Terminal::new(TestBackend::new(width, height)).expect("a screen");
-        let site = "yard".parse().expect("a site");
-        let picture = Picture {
-            site: &site,
-            address: "http://here",
-            known,
-            shown: &View::default(),
-        };
-        terminal
-            .draw(|frame| draw(frame, &picture))
-            .expect("it is drawn");
-        terminal.backend().to_string()
-    }
-
-    #[test]
-    fn every_robot_is_shown_on_any_screen_and_a_tiny_one_breaks_nothing() {
-        let mut known = SiteState::default();
-        known.take(robot("rover-1", "online"));
-        known.take(robot("rover-2", "offline"));
-        assert!(picture(&known, 100, 20).contains("reading"));
-        known.take(Event::SnapshotEnd);
-        for (width, height) in [(80, 24), (160, 50), (90, 16)] {
-            let text = picture(&known, width, height);
-            for word in ["rover-1", "rover-2", "1 online", "1 offline", "live"] {
-                assert!(text.contains(word), "{word} at {width}x{height}:\n{text}");
-            }
-        }
-        for (width, height) in [(1, 1), (5, 3), (30, 6)] {
-            picture(&known, width, height);
-        }
-    }
-
-    #[test]
-    fn a_bar_is_as_full_as_the_mission_has_come() {
-        let progress = |driven_m: f64| MissionProgress {
-            id: "0192f0c1-2b3c-7d4e-8f50-617283940a1b"
-                .parse()
-                .expect("an id"),
-            revision: 1,
-            plan_hash: "0192f0c1-2b3c-7d4e-8f50-617283940a1b"
-                .parse()
-                .expect("an id"),
-            driven_m,
-            length_m: 10.0,
-            cross_track_m: 0.0,
-            paused: false,
-            paused_by: None,
-        };
-        assert_eq!(bar(Some(progress(5.0))), "█████░░░░░  50 %");
-        assert_eq!(bar(Some(progress(12.0))), "██████████ 100 %");
-        assert_eq!(bar(None), "-");
-    }
-}
+mod tests;

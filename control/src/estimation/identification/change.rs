@@ -218,6 +218,7 @@ mod tests {
         monitor: ChangeMonitor,
         random: ChaCha8Rng,
         time_s: f64,
+        has_torque: bool,
     }
 
     impl Drive {
@@ -237,6 +238,7 @@ mod tests {
                 monitor,
                 random: ChaCha8Rng::seed_from_u64(seed),
                 time_s: 0.0,
+                has_torque: true,
             }
         }
 
@@ -269,7 +271,7 @@ mod tests {
             let compared = std::array::from_fn(|channel| {
                 let of_12 = (0..12).map(|_| self.random.random::<f64>() - 0.5);
                 let factor = if channel > 2 { scaled } else { 1.0 };
-                Some(ChannelComparison {
+                (channel < TORQUES_FROM || self.has_torque).then_some(ChannelComparison {
                     measured: factor * truth[channel] + STD_DEVS[channel] * of_12.sum::<f64>(),
                     output: outputs[channel],
                     std_dev: STD_DEVS[channel],
@@ -295,6 +297,17 @@ mod tests {
             let delay = (0..400).position(|_| drive.compare(stiffness, 1.0, Motion::Rolling));
             let is_in_time = delay.is_some_and(|delay| delay < most);
             assert!(is_in_time, "{stiffness}: {delay:?}");
+        }
+    }
+
+    #[test]
+    fn ground_that_becomes_very_slippery_is_detected_without_torque() {
+        for seed in 0..4 {
+            let mut drive = Drive::new(seed);
+            drive.has_torque = false;
+            assert!(!(0..200).any(|_| drive.compare(3.0, 1.0, Motion::Rolling)));
+            let delay = (0..400).position(|_| drive.compare(0.2, 1.0, Motion::Rolling));
+            assert!(delay.is_some_and(|delay| delay < 60), "{seed}: {delay:?}");
         }
     }
 

@@ -16,8 +16,8 @@ const RATIO_MAX: f64 = 2.0;
 /// Share of the earlier blocks that the usual mean square exceeds.
 const USUAL_SHARE: f64 = 0.7;
 /// Number of newest blocks that are judged, and of those that do not fit from which the estimate does not.
-const JUDGED: u32 = 5;
-const MISFITS_MIN: u32 = 3;
+const JUDGED: usize = 5;
+const MISFITS_MIN: usize = 3;
 /// Minimum of the usual mean square: residuals as small as sensors and model are assumed to make them.
 const USUAL_MIN: f64 = 1.0;
 /// Minimum number of earlier blocks.
@@ -33,10 +33,8 @@ pub(super) struct Fit {
     /// Mean squares of the last block, which are not among the usual ones yet.
     last: [Option<f64>; COMPARED],
     usual: [RecentBlocks; COMPARED],
-    /// A bit for each of the newest blocks, set if it does not fit.
-    misfits: u32,
-    /// Largest ratio of a mean square of the last block to the usual one.
-    ratio: f64,
+    /// Largest ratio of a mean square to the usual one, for each of the newest blocks.
+    ratios: [f64; JUDGED],
 }
 
 impl Fit {
@@ -46,8 +44,7 @@ impl Fit {
             open: [(0.0, 0.0); COMPARED],
             last: [None; COMPARED],
             usual: [const { RecentBlocks::new() }; COMPARED],
-            misfits: 0,
-            ratio: 1.0,
+            ratios: [0.0; JUDGED],
         }
     }
 
@@ -72,7 +69,8 @@ impl Fit {
 
     /// Ends the open block.
     pub(super) fn end_block(&mut self) {
-        self.ratio = 0.0;
+        self.ratios.rotate_left(1);
+        let mut ratio = 0.0_f64;
         for channel in 0..COMPARED {
             let (sum, count) = std::mem::take(&mut self.open[channel]);
             if count <= 0.0 {
@@ -82,12 +80,11 @@ impl Fit {
             let usual = &self.usual[channel];
             let known = usual.quantile(USUAL_SHARE);
             if let Some(usual) = known.filter(|_| usual.count() >= BLOCKS_MIN) {
-                self.ratio = self.ratio.max(square / usual.max(USUAL_MIN));
+                ratio = ratio.max(square / usual.max(USUAL_MIN));
             }
             self.last[channel] = Some(square);
         }
-        let newest = (1 << JUDGED) - 1;
-        self.misfits = ((self.misfits << 1) & newest) | u32::from(self.ratio > RATIO_MAX);
+        self.ratios[JUDGED - 1] = ratio;
     }
 
     /// Drops the open block.
@@ -95,10 +92,12 @@ impl Fit {
         self.open = [(0.0, 0.0); COMPARED];
     }
 
-    /// Returns the factor by which the last block's residuals exceed the usual ones, as a ratio of root
-    /// mean squares, if the newest blocks do not fit the estimate.
+    /// Returns the largest factor by which residuals of one of the newest blocks exceed the usual ones, as a
+    /// ratio of root mean squares, if these blocks do not fit the estimate.
     pub(super) fn misfit_ratio(&self) -> Option<f64> {
-        (self.misfits.count_ones() >= MISFITS_MIN).then(|| self.ratio.sqrt())
+        let misfits = self.ratios.iter().filter(|ratio| **ratio > RATIO_MAX);
+        let largest = self.ratios.into_iter().fold(0.0, f64::max);
+        (misfits.count() >= MISFITS_MIN).then(|| largest.sqrt())
     }
 }
 
@@ -140,9 +139,9 @@ mod tests {
     }
 
     #[test]
-    fn the_ratio_is_that_of_the_last_block() {
+    fn the_ratio_is_that_of_the_worst_of_the_newest_blocks() {
         let mut fit = Fit::new();
-        for root in [[1.0; 12].as_slice(), &[4.0; 3]].concat() {
+        for root in [[1.0; 12].as_slice(), &[3.0, 4.0, 3.0, 1.0]].concat() {
             add_block(&mut fit, 2, root);
         }
         assert_eq!(fit.misfit_ratio(), Some(4.0));

@@ -613,7 +613,7 @@ impl Identification {
     pub(super) fn identified(&self) -> Option<Identified> {
         let best = self.best()?;
         let is_known = best.age() >= BLOCKS_MIN && best.is_determined();
-        if !is_known || self.misfit_ratio().is_some() {
+        if !is_known || self.misfit_ratio().is_some() || self.newest_misfit_ratio().is_some() {
             return None;
         }
         let least = self.least_cost();
@@ -651,14 +651,16 @@ impl Identification {
     }
 
     /// Returns the root mean square of the best hypothesis's standardised residuals in its worst
-    /// channel where it is too large for an estimate; or that of the last block, relative to the usual
-    /// one, where the newest blocks contradict a converged estimate.
+    /// channel, where it is too large for an estimate.
     pub(super) fn misfit_ratio(&self) -> Option<f64> {
+        let square = self.best()?.worst_square();
+        (square > SQUARE_MAX).then(|| square.sqrt())
+    }
+
+    /// Returns the factor by which residuals of the newest blocks exceed the usual ones, where they
+    /// contradict a converged estimate.
+    pub(super) fn newest_misfit_ratio(&self) -> Option<f64> {
         let best = self.best()?;
-        let square = best.worst_square();
-        if square > SQUARE_MAX {
-            return Some(square.sqrt());
-        }
         self.fit.misfit_ratio().filter(|_| best.has_converged())
     }
 

@@ -15,6 +15,7 @@ impl Identification {
             hypothesis.drop_last_block(&self.prior);
         }
         self.segment_s = (self.segment_s - std::mem::take(&mut self.last_block_s)).max(0.0);
+        self.fit.drop_block();
         self.block_s = 0.0;
         self.is_moving = false;
     }

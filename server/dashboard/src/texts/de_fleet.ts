@@ -189,18 +189,18 @@ export const fleet: Pick<Texts, Areas> = {
     slip: 'Radschlupf, links und rechts',
     excited: 'reicht, um θ zu messen',
     unexcited: 'zu gering, um θ zu messen',
-    noEstimate: 'Keine Schätzung von θ',
+    noEstimate: 'Warum θ nicht genau genug bekannt ist',
     noEstimateFor: {
       misfit:
-        'Die Bewegungsgleichungen beschreiben nicht, was die Sensoren messen. Warten Sie, wenn der Boden eben gewechselt hat; sonst hilft tread-agent doctor.',
+        'Die Bewegungsgleichungen beschreiben nicht, was die Sensoren messen. Fahren Sie einige Sekunden weiter, wenn der Boden eben gewechselt hat; sonst hilft tread-agent doctor.',
       short: 'Der Roboter ist auf diesem Boden zu wenig gefahren. Fahren Sie 20 s oder länger ohne Pause.',
-      slip: 'Der Schlupf der Räder liegt außerhalb des Bereichs, in dem er etwas über die Reibung sagt. Fahren Sie weitere Bögen, langsamer, und drehen Sie nicht auf der Stelle.',
-      no_turns: 'Der Roboter fuhr fast nur geradeaus. Fahren Sie Bögen nach beiden Seiten, etwa eine Acht.',
+      slip: 'Der Schlupf der Räder liegt außerhalb des Bereichs, in dem aus ihm die Reibung folgt. Fahren Sie größere Bögen, langsamer, und drehen Sie nicht auf der Stelle.',
+      no_turns: 'Der Roboter fuhr kaum Bögen. Fahren Sie welche nach beiden Seiten, etwa eine Acht.',
       one_sided: 'Fast alle Bögen gingen nach einer Seite. Fahren Sie nach beiden Seiten, etwa eine Acht.',
       no_acceleration:
-        'Die Geschwindigkeit änderte sich kaum. Beschleunigen und bremsen Sie um die halbe Geschwindigkeit innerhalb von drei Sekunden.',
+        'Die Geschwindigkeit änderte sich kaum. Ändern Sie sie mehrmals um die Hälfte innerhalb von drei Sekunden.',
       uncertain:
-        'Das 95-%-Intervall ist noch breiter als ± 60 %. Fahren Sie eine Minute lang Achten von 2 bis 4 m mit wechselnder Geschwindigkeit.',
+        'Die bisherigen Manöver reichen nicht. Fahren Sie eine Minute lang Achten von 2 bis 4 m mit wechselnder Geschwindigkeit.',
       other: 'Aus einem Grund, den diese Seite nicht kennt.',
     },
     newMission: 'Neue Mission',
