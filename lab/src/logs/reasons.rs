@@ -7,6 +7,7 @@
 
 use serde::Serialize;
 
+use tread_api::friction::NoEstimate;
 use tread_control::estimation::NORMAL_95;
 use tread_control::estimation::manoeuvre::is_saturated;
 
@@ -26,6 +27,11 @@ pub struct Reason {
     pub reason: String,
     /// What to do.
     pub help: &'static str,
+}
+
+/// Returns what a robot without an estimate is asked for, for this reason.
+fn help(reason: NoEstimate) -> &'static str {
+    reason.help().unwrap_or_default()
 }
 
 fn percent(share: f64) -> String {
@@ -145,7 +151,7 @@ fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
         reasons.push(Reason {
             code: "short",
             reason: format!("the robot drove for {:.1} s only", manoeuvres.moving_s),
-            help: "drive for 20 s or more without a break",
+            help: help(NoEstimate::Short),
         });
     }
     if is_saturated(outcome.estimate.saturation_share) {
@@ -155,7 +161,7 @@ fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
                 "the wheels slip beyond the range in which friction follows from slip in {} of the time",
                 percent(outcome.estimate.saturation_share)
             ),
-            help: "turn in wider arcs, more slowly, and not on the spot",
+            help: help(NoEstimate::Slip),
         });
     }
     if manoeuvres.has_no_turns() {
@@ -167,7 +173,7 @@ fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
         reasons.push(Reason {
             code: "no_turns",
             reason: format!("the robot rolled straight on nearly all the time{spot}"),
-            help: "drive arcs to both sides, as in a figure-8",
+            help: help(NoEstimate::NoTurns),
         });
     } else if manoeuvres.is_one_sided() {
         reasons.push(Reason {
@@ -175,14 +181,14 @@ fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
             reason:
                 "nearly all turns were to one side, so that different wheel radii look like slip"
                     .to_owned(),
-            help: "turn to both sides, as in a figure-8",
+            help: help(NoEstimate::OneSided),
         });
     }
     if manoeuvres.has_no_acceleration() {
         reasons.push(Reason {
             code: "no_acceleration",
             reason: "the speed hardly changed".to_owned(),
-            help: "change the speed by half within three seconds, several times",
+            help: help(NoEstimate::NoAcceleration),
         });
     }
     if outcome.estimate.no_new_information {
