@@ -218,6 +218,9 @@ pub enum NoEstimate {
     /// The equations of motion do not describe what the sensors measure: the ground has changed, a sensor
     /// is wrong, or the model is.
     Misfit,
+    /// The gyro or the accelerometer is not of the same time as the wheel speeds: by more than can be identified, or
+    /// differently than before.
+    LateSensor,
     /// The robot has not driven for long enough.
     Short,
     /// The wheels slip beyond the range in which friction follows from slip nearly all the time.
@@ -240,6 +243,7 @@ impl NoEstimate {
     pub fn reason(self) -> &'static str {
         match self {
             Self::Misfit => "the equations of motion do not describe what the sensors measure",
+            Self::LateSensor => "the gyro or the accelerometer is late, or its delay has changed",
             Self::Short => "the robot has driven too little on this ground",
             Self::Slip => "the wheels slip beyond the range in which friction follows from slip",
             Self::NoTurns => "the robot drove hardly any arcs",
@@ -255,6 +259,9 @@ impl NoEstimate {
         match self {
             Self::Misfit => Some(
                 "drive on for some seconds if the ground has just changed; otherwise run `tread-agent doctor`",
+            ),
+            Self::LateSensor => Some(
+                "drive on for some seconds if the ground has just changed; otherwise check the time stamps and filters of wheel speeds and inertial unit",
             ),
             Self::Short => Some("drive for 20 s or more without a break"),
             Self::Slip => Some("turn in wider arcs, more slowly, and not on the spot"),

@@ -29,6 +29,45 @@ fn drive(robot: &mut SimRobot, duration_s: f64, turn_rad_s: impl Fn(f64) -> f64)
     }
 }
 
+/// Drives arcs from side to side.
+fn weave(robot: &mut SimRobot, duration_s: f64) {
+    drive(robot, duration_s, |time_s| 0.6 * (0.9 * time_s).sin());
+}
+
+#[test]
+fn a_gyro_that_becomes_late_withholds_theta_and_is_the_reason() {
+    let mut robot = robot();
+    weave(&mut robot, 40.0);
+    let sound = robot.estimator.estimate();
+    assert_eq!(
+        (sound.no_estimate, sound.late_sensor),
+        (None, None),
+        "{sound:?}"
+    );
+    // 60 ms at 200 Hz.
+    robot.gyro_delay_samples = 12;
+    let mut reasons = Vec::new();
+    for _ in 0..15 {
+        weave(&mut robot, 1.0);
+        let now = robot.estimator.estimate();
+        assert_eq!(now.no_estimate.is_none(), now.theta.is_some());
+        reasons.push(now.no_estimate);
+    }
+    let first = reasons.iter().position(Option::is_some);
+    assert!(first.is_some_and(|second| second <= 5), "{reasons:?}");
+    let last = robot.estimator.estimate();
+    assert_eq!(
+        last.no_estimate,
+        Some(NoEstimate::LateSensor),
+        "{reasons:?}"
+    );
+    let late = last.late_sensor.expect("it is late");
+    assert!(
+        late.newest.gyro_s > late.identified.gyro_s.min(0.03),
+        "{late:?}"
+    );
+}
+
 #[test]
 fn a_robot_is_asked_for_what_it_has_not_driven_until_theta_is_known() {
     let mut robot = robot();

@@ -37,6 +37,8 @@ const REMEMBERED: Duration = Duration::from_mins(1);
 pub enum NoEstimate {
     /// The residuals are too large for the model, or much larger than before.
     Misfit,
+    /// Gyro or accelerometer is later, or earlier, than can be identified, or its delay has changed.
+    LateSensor,
     /// The robot has not driven for long enough.
     Short,
     /// The wheels slip beyond the range in which friction follows from slip nearly all the time.

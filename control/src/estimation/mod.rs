@@ -72,9 +72,9 @@ pub use segment::SegmentStatistics;
 use segment::{SegmentTheta, SegmentVariance, StatedInformation};
 use sums::Sums;
 pub use types::{
-    CommonError, Estimate, EstimatorPrior, IdentifiedRobot, IdentifiedValue, ModelUncertainty,
-    PayloadChange, SensorNoise, SensorSample, ThetaMeasurement, TyrePrior, UpdateOutcome,
-    ValueWithStdDev,
+    CommonError, Estimate, EstimatorPrior, IdentifiedRobot, IdentifiedValue, LateSensor,
+    ModelUncertainty, PayloadChange, SensorDelays, SensorNoise, SensorSample, ThetaMeasurement,
+    TyrePrior, UpdateOutcome, ValueWithStdDev,
 };
 
 /// Duration of a block, over which samples are averaged, seconds.
@@ -467,12 +467,15 @@ impl Estimator {
         let identification = self.identification.as_ref();
         let misfit_ratio = identification.and_then(|found| found.misfit_ratio());
         let newest_misfit_ratio = identification.and_then(|found| found.newest_misfit_ratio());
+        let late_sensor = identification.and_then(|found| found.late_sensor());
         let is_estimate = theta.is_some_and(|found| {
             NORMAL_95 * found.std_dev <= ESTIMATE_HALF_WIDTH_MAX_RATIO * found.theta
         });
         let no_estimate = (!is_estimate).then(|| {
             if misfit_ratio.or(newest_misfit_ratio).is_some() {
                 NoEstimate::Misfit
+            } else if late_sensor.is_some() {
+                NoEstimate::LateSensor
             } else {
                 self.manoeuvres.times().lacks(sums.saturation_share())
             }
@@ -485,6 +488,7 @@ impl Estimator {
             saturation_share: sums.saturation_share(),
             misfit_ratio,
             newest_misfit_ratio,
+            late_sensor,
             frozen_torque: self.frozen_torque.frozen(),
             dropped_samples: self.dropped_samples,
             robot: self.identification.as_ref().and_then(|found| found.robot()),

@@ -57,13 +57,14 @@ pub struct TyrePrior {
     #[serde(alias = "side_grip_spread")]
     pub lateral_stiffness_std_dev: f64,
     /// Mean of θκ in `λ = θμ(1 + κλ + ⅔κ²λ²)`, per friction coefficient: 0 for the paper's linear
-    /// curve, `1/(3μ_p)` for a brush model with the peak `μ_p`.
+    /// curve, `1/(3μ_p)` for a brush model with the peak `μ_p`. Where all parameters are identified it
+    /// counts if its standard deviation is below that of unknown tyres.
     pub curvature: f64,
     /// Standard deviation of θκ, per friction coefficient. Turns of one radius do not excite θκ, so
     /// its uncertainty widens the intervals of θ.
     pub curvature_std_dev: f64,
     /// Largest friction coefficient at which this curve is valid, below the smallest possible peak;
-    /// `None` if only slip limits it.
+    /// `None` if only slip limits it. Where all parameters are identified the peak follows it.
     pub mu_max: Option<f64>,
     /// Mean of the contacts' relaxation length at zero slip, metres: the rolling distance in which
     /// force follows slip.
@@ -345,6 +346,8 @@ pub struct Estimate {
     /// Factor by which residuals of the newest seconds exceed those before, where they contradict the
     /// estimate so much that there is no θ.
     pub newest_misfit_ratio: Option<f64>,
+    /// Delays of gyro and accelerometer, where they are too large or have changed, so that there is no θ.
+    pub late_sensor: Option<LateSensor>,
     /// Wheel torques that the sensor repeats to the last bit while the robot drives; θ is estimated without
     /// them.
     pub frozen_torque: Option<WheelTorques>,
@@ -354,6 +357,24 @@ pub struct Estimate {
     pub robot: Option<IdentifiedRobot>,
     /// The last change of the payload, for ten minutes of samples.
     pub payload_change: Option<PayloadChange>,
+}
+
+/// Delays of the inertial sensors relative to the wheel speeds, by their time stamps.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SensorDelays {
+    /// Delay of the gyro, seconds.
+    pub gyro_s: f64,
+    /// Delay of the accelerometer, seconds.
+    pub accelerometer_s: f64,
+}
+
+/// Delays of which at least one is too large, or has changed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LateSensor {
+    /// Delays in the newest seconds; the identified ones where these do not show any.
+    pub newest: SensorDelays,
+    /// Delays that the estimate assumes.
+    pub identified: SensorDelays,
 }
 
 /// An estimated value with its standard deviation.

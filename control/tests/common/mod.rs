@@ -94,6 +94,10 @@ pub(crate) struct SimRobot {
     /// Errors of the left and right torque constants.
     pub(crate) torque_gain: [f64; 2],
     pub(crate) accelerometer_offset: f64,
+    /// Delay of the gyro that its time stamps do not have, in samples.
+    pub(crate) gyro_delay_samples: usize,
+    /// Turn rates of the last samples, the newest one first.
+    turn_rates_rad_s: std::collections::VecDeque<f64>,
     /// Torque of an obstacle on the left wheels, newton metres.
     pub(crate) struck_n_m: f64,
     limits: GateLimits,
@@ -138,6 +142,8 @@ impl SimRobot {
             ground_changes: 0,
             torque_gain,
             accelerometer_offset,
+            gyro_delay_samples: 0,
+            turn_rates_rad_s: std::collections::VecDeque::new(),
             struck_n_m: 0.0,
             limits: GateLimits::of(&model),
             is_gated: true,
@@ -252,7 +258,10 @@ impl SimRobot {
             left_rad_s: seen.wheel_speeds.left_rad_s + self.gauss(noise.wheel_speed_rad_s),
             right_rad_s: seen.wheel_speeds.right_rad_s + self.gauss(noise.wheel_speed_rad_s),
         };
-        let gyro_rad_s = seen.yaw_rate_rad_s + self.gauss(noise.gyro_rad_s);
+        self.turn_rates_rad_s.push_front(seen.yaw_rate_rad_s);
+        self.turn_rates_rad_s.truncate(self.gyro_delay_samples + 1);
+        let turn_rad_s = self.turn_rates_rad_s.back().copied().unwrap_or_default();
+        let gyro_rad_s = turn_rad_s + self.gauss(noise.gyro_rad_s);
         let felt = seen.acceleration;
         let torques = self.plant.wheel_torques();
         let torque_noise = noise.torque_mu * self.model.wheel_radius_m() * self.model.side_load_n();

@@ -11,8 +11,9 @@ use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
 use crate::rough::drive::SimulatedPlant;
+use crate::rough::gravity::gravity_m_s2;
 use crate::rough::means::Means;
-use crate::rough::plant::{State, Truth, gravity_m_s2};
+use crate::rough::plant::{State, Truth};
 use crate::rough::sensors::SAMPLE_PERIOD;
 use crate::rough::spec::Deviations;
 

@@ -8,8 +8,8 @@
 use serde::Serialize;
 
 use tread_api::friction::NoEstimate;
-use tread_control::estimation::NORMAL_95;
 use tread_control::estimation::manoeuvre::is_saturated;
+use tread_control::estimation::{LateSensor, NORMAL_95, SensorDelays};
 
 use super::estimate::Outcome;
 use super::stretches::{ESTIMATOR_GAP_S, Motion};
@@ -140,7 +140,33 @@ fn of_recording(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
             help: "look for a change of the ground, or a sensor that failed; estimates from before are under `passes`",
         });
     }
+    if let Some(late) = outcome.estimate.late_sensor {
+        reasons.push(Reason {
+            code: "late_sensor",
+            reason: late_text(&late, motion.has_acceleration),
+            help: help(NoEstimate::LateSensor),
+        });
+    }
     reasons
+}
+
+/// Returns the delays of a late sensor in milliseconds.
+fn late_text(late: &LateSensor, has_accelerometer: bool) -> String {
+    let sensor = |name: &str, of: fn(&SensorDelays) -> f64| {
+        let [newest_ms, identified_ms] =
+            [&late.newest, &late.identified].map(|delays| 1.0e3 * of(delays));
+        format!(
+            "the {name} is {newest_ms:.0} ms later than the wheel speeds (identified: {identified_ms:.0} ms)"
+        )
+    };
+    let mut sensors = vec![sensor("gyro", |delays| delays.gyro_s)];
+    if has_accelerometer {
+        sensors.push(sensor("accelerometer", |delays| delays.accelerometer_s));
+    }
+    format!(
+        "by the time stamps {}; delays of up to 30 ms that do not change are identified",
+        sensors.join(", ")
+    )
 }
 
 /// What of the motion leaves θ unknown.
@@ -313,6 +339,46 @@ mod tests {
         assert!(
             found[0].reason.contains("3.2 times those before"),
             "{found:?}"
+        );
+    }
+
+    #[test]
+    fn delays_of_a_late_sensor_are_stated_in_milliseconds() {
+        let late = Outcome {
+            estimate: Estimate {
+                late_sensor: Some(LateSensor {
+                    newest: SensorDelays {
+                        gyro_s: 0.0412,
+                        accelerometer_s: 0.0,
+                    },
+                    identified: SensorDelays {
+                        gyro_s: 0.012,
+                        accelerometer_s: 0.0,
+                    },
+                }),
+                ..Estimate::default()
+            },
+            ..outcome()
+        };
+        let found = reasons(&excited(), &late);
+        let reason = &found[0].reason;
+        assert_eq!(found[0].code, "late_sensor");
+        assert!(
+            reason.contains("gyro is 41 ms") && reason.contains("identified: 12 ms"),
+            "{reason}"
+        );
+        assert!(
+            !reason.contains("accelerometer"),
+            "it measured none: {reason}"
+        );
+        let motion = Motion {
+            has_acceleration: true,
+            ..excited()
+        };
+        assert!(
+            reasons(&motion, &late)[0]
+                .reason
+                .contains("accelerometer is 0 ms")
         );
     }
 

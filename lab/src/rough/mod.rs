@@ -5,10 +5,12 @@
 //! positions. The agent's control loop drives the robot closed-loop, with a configuration from the
 //! data sheet as an integrator would write.
 
+mod arithmetic;
 pub mod bound;
 pub mod curve;
 pub mod disturbance;
 pub mod drive;
+pub mod gravity;
 pub mod ground_change;
 pub mod means;
 pub mod plant;

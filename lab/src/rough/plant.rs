@@ -13,7 +13,9 @@ use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
+use super::arithmetic::{length, tanh};
 use super::curve::{ContactSlip, Curve, Shape};
+use super::gravity::gravity_m_s2;
 use super::means::{Means, Moment, Sums};
 use super::spec::Deviations;
 
@@ -73,24 +75,6 @@ pub struct Truth {
     pub gravity_m_s2: [f64; 2],
 }
 
-/// Returns the gravitational acceleration on a plane of these slopes in the frame of a robot with a
-/// heading: forward, left, into the ground.
-pub fn gravity_m_s2(slope_rad: [f64; 2], heading_rad: f64) -> [f64; 3] {
-    let [x_rad, y_rad] = slope_rad;
-    let (rise_x, rise_y) = (x_rad.tan(), y_rad.tan());
-    let upright = (1.0 + rise_x.powi(2) + rise_y.powi(2)).sqrt().recip();
-    let (sin, cos) = heading_rad.sin_cos();
-    let down = [
-        -rise_x * upright * GRAVITY_M_S2,
-        -rise_y * upright * GRAVITY_M_S2,
-    ];
-    [
-        cos * down[0] + sin * down[1],
-        -sin * down[0] + cos * down[1],
-        upright * GRAVITY_M_S2,
-    ]
-}
-
 /// Drive of the wheels in one integration step; values are `[left, right]`.
 #[derive(Debug, Clone, Copy)]
 enum WheelDrive {
@@ -123,6 +107,8 @@ pub struct Plant {
     motor_n_m: [f64; 2],
     /// Accumulated wheel angles `[left, right]`, radians.
     turned_rad: [f64; 2],
+    /// Gravitational acceleration at the heading 0: forward, left, into the ground.
+    gravity_m_s2: [f64; 3],
     blend: Option<(Shape, f64)>,
 }
 
@@ -184,6 +170,7 @@ impl Plant {
             integral_n_m: [0.0; 2],
             motor_n_m: [0.0; 2],
             turned_rad: [0.0; 2],
+            gravity_m_s2: gravity_m_s2(spec.slope_rad, 0.0),
             blend: None,
             spec,
         };
@@ -216,10 +203,7 @@ impl Plant {
             turned_rad: self.turned_rad,
             torque_scale: self.spec.torque_scale,
             tilt_rad: self.tilt_rad(),
-            gravity_m_s2: {
-                let [forward, left, _] = self.gravity_m_s2();
-                [forward, left]
-            },
+            gravity_m_s2: self.level_gravity_m_s2(self.pose.heading_rad.sin_cos().into()),
         }
     }
 
@@ -247,21 +231,25 @@ impl Plant {
 
     /// Returns the ratio of the largest contact slip to the slip at the peak of the friction curve.
     pub fn slip_over_peak(&self) -> f64 {
-        let slips = self.contacts.iter();
-        let slips = slips.map(|contact| contact.deflection[0].hypot(contact.deflection[1]));
+        let slips = self
+            .contacts
+            .iter()
+            .map(|contact| length(contact.deflection));
         slips.fold(0.0, f64::max) / self.spec.curve.peak_slip()
     }
 
-    /// Returns the gravitational acceleration in the body frame: forward, left, into the ground.
-    fn gravity_m_s2(&self) -> [f64; 3] {
-        gravity_m_s2(self.spec.slope_rad, self.pose.heading_rad)
+    /// Returns the gravitational acceleration along the ground in the body frame, forward and left, given
+    /// sine and cosine of the heading.
+    fn level_gravity_m_s2(&self, [sin, cos]: [f64; 2]) -> [f64; 2] {
+        let [x, y, _] = self.gravity_m_s2;
+        [cos * x + sin * y, -sin * x + cos * y]
     }
 
     /// Moves the wheel loads towards equilibrium with the moments of the contact forces, by the
     /// fraction `share` of the difference.
     fn update_loads(&mut self, share: f64) {
         let height_m = self.center_m[2];
-        let weight_n = self.mass_kg * self.gravity_m_s2()[2];
+        let weight_n = self.mass_kg * self.gravity_m_s2[2];
         let moments = Vector3::new(
             weight_n,
             -height_m * self.load_force_n[0],
@@ -284,10 +272,12 @@ impl Plant {
 
     /// Returns the ratio μ/λ of the blended friction curve.
     fn mu_over_slip(&self, contact: ContactSlip) -> f64 {
-        let curve = self.spec.curve;
-        let own = curve.mu_over_slip(contact);
+        let own = self.spec.curve.mu_over_slip(contact);
         self.blend.map_or(own, |(shape, share)| {
-            let other = Curve { shape, ..curve };
+            let other = Curve {
+                shape,
+                ..self.spec.curve
+            };
             (1.0 - share) * own + share * other.mu_over_slip(contact)
         })
     }
@@ -320,7 +310,7 @@ impl Plant {
         let damping =
             2.0 * DAMPING_RATIO * (curve.stiffness * self.spec.relaxation_m / GRAVITY_M_S2).sqrt();
         self.contacts.map(|contact| {
-            let slip = contact.deflection[0].hypot(contact.deflection[1]);
+            let slip = length(contact.deflection);
             let mu_over_slip = self.mu_over_slip(ContactSlip {
                 slip,
                 sliding_m_s: contact.slip_m_s,
@@ -334,7 +324,7 @@ impl Plant {
                 let gives = velocity[axis] - rim_m_s * contact.deflection[axis];
                 contact.load_n * (mu_over_slip * contact.deflection[axis] + damped * gives)
             });
-            let size_n = force[0].hypot(force[1]);
+            let size_n = length(force);
             if size_n > most_n {
                 force = force.map(|part| part * most_n / size_n);
             }
@@ -361,7 +351,8 @@ impl Plant {
             *slow_n += share * (now_n - *slow_n);
         }
         self.update_loads(share);
-        let gravity = self.gravity_m_s2();
+        let (sin, cos) = self.pose.heading_rad.sin_cos();
+        let gravity = self.level_gravity_m_s2([sin, cos]);
         let acceleration = [
             force[0] / self.mass_kg + gravity[0],
             force[1] / self.mass_kg + gravity[1],
@@ -376,7 +367,7 @@ impl Plant {
         for side in 0..2 {
             let (radius_m, speed) = (self.radius_m[side], self.wheels_rad_s[side]);
             let contact_n_m = side_n[side] * radius_m;
-            let turns = (speed * radius_m / RESISTANCE_TURNS_M_S).tanh();
+            let turns = tanh(speed * radius_m / RESISTANCE_TURNS_M_S);
             let resistance =
                 self.spec.rolling_resistance_ratio * side_load_n[side] * radius_m * turns;
             let lost = self.spec.gear_loss_ratio * contact_n_m.abs() * turns;
@@ -395,7 +386,6 @@ impl Plant {
             self.turned_rad[side] += STEP_S * self.wheels_rad_s[side];
         }
         self.deflect();
-        let (sin, cos) = self.pose.heading_rad.sin_cos();
         let [forward, left] = self.speed_m_s;
         self.pose = Pose {
             x_m: self.pose.x_m + STEP_S * (cos * forward - sin * left),
@@ -426,13 +416,13 @@ impl Plant {
         let velocities = self.contacts.map(|contact| self.slip_velocity(&contact));
         for (contact, velocity) in self.contacts.iter_mut().zip(velocities) {
             let rim_m_s = self.wheels_rad_s[contact.side] * self.radius_m[contact.side];
-            contact.slip_m_s = velocity[0].hypot(velocity[1]);
+            contact.slip_m_s = length(velocity);
             let share = STEP_S / length_m;
             for (axis, deflection) in contact.deflection.iter_mut().enumerate() {
                 *deflection =
                     (*deflection + share * velocity[axis]) / (1.0 + share * rim_m_s.abs());
             }
-            let size = contact.deflection[0].hypot(contact.deflection[1]);
+            let size = length(contact.deflection);
             // At low rim speed the contact slides beyond the peak of the curve.
             let most = if rim_m_s.abs() < DAMPED_BELOW_M_S {
                 self.spec.curve.peak_slip().min(DEFLECTION_MAX)

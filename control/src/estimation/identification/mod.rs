@@ -11,6 +11,8 @@
 
 mod blocks;
 mod change;
+mod curve_prior;
+mod delays;
 mod dual;
 mod fast_changes;
 mod fit;
@@ -34,16 +36,18 @@ mod tyre_tests;
 mod wheel_noise;
 
 use super::payload::STANDING_M_S;
-use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, SensorNoise, SensorSample};
+use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, LateSensor, SensorNoise, SensorSample};
 use crate::geometry::Twist;
 use crate::measured::BodyAcceleration;
 use crate::robot::RobotModel;
 
 use change::{COMPARED, ChangeMonitor, ChannelComparison, Motion};
+use delays::{DelayResidual, Delays};
 use fit::Fit;
 use hypothesis::{Hypothesis, Measured};
 use model::{CHANNELS, Input, State, gravity_m_s2};
 use parameters::{Prior, index};
+use simulation::delays_s;
 use wheel_noise::WheelNoise;
 
 /// Starting values of ln K: K 1, 3.3 and 11.
@@ -142,6 +146,7 @@ pub(super) struct Identification {
     is_robot_due: bool,
     change: ChangeMonitor,
     fit: Fit,
+    delays: Delays,
     wheel_noise: WheelNoise,
     /// Whether the last sample had wheel torques.
     has_torque: bool,
@@ -190,6 +195,7 @@ impl Identification {
             is_robot_due: false,
             change: ChangeMonitor::default(),
             fit: Fit::new(),
+            delays: Delays::new(),
             wheel_noise: WheelNoise::new(),
             has_torque: false,
         };
@@ -203,6 +209,7 @@ impl Identification {
         self.hypotheses.clear();
         self.change = ChangeMonitor::default();
         self.fit = Fit::new();
+        self.delays.restart();
         for start in STARTS {
             self.hypotheses
                 .push(Hypothesis::new(&self.prior, start, *state));
@@ -261,6 +268,7 @@ impl Identification {
         self.wheel_noise.interrupt();
         self.change = ChangeMonitor::default();
         self.fit.drop_block();
+        self.delays.restart();
         self.clear_sums();
         self.block_s = 0.0;
         self.is_moving = false;
@@ -426,6 +434,7 @@ impl Identification {
         let mut compared = [None; COMPARED];
         for hypothesis in &mut self.hypotheses {
             let is_best = hypothesis.cost() <= least;
+            let delays_s = delays_s(hypothesis.values());
             let outputs = hypothesis.take_outputs(compared_s);
             for (channel, output) in outputs.into_iter().enumerate() {
                 // Means are of the same time only if nothing is missing.
@@ -434,8 +443,18 @@ impl Identification {
                 }
                 let measured = sums[channel] / compared_s;
                 if is_best {
-                    self.fit
-                        .add(channel, (measured - output.value()) / std_devs[channel]);
+                    let standardised = (measured - output.value()) / std_devs[channel];
+                    self.fit.add(channel, standardised);
+                    // Noise in outputs and their rates would look like a delay.
+                    let is_noisy = self.wheel_noise.is_noise_added;
+                    if let Some(delay_s) = delays_s.get(channel).filter(|_| !is_noisy) {
+                        let compared = DelayResidual {
+                            standardised,
+                            slope_1_s: output.slope(index::GYRO_DELAY) / std_devs[channel],
+                            delay_s: *delay_s,
+                        };
+                        self.delays.add(channel, compared);
+                    }
                     compared[channel] = Some(ChannelComparison {
                         measured,
                         output: output.value(),
@@ -499,9 +518,12 @@ impl Identification {
                 hypothesis.drop_block();
             }
             self.fit.drop_block();
+            self.delays.drop_block();
             return;
         }
         self.fit.end_block();
+        let has_converged = self.best().is_some_and(Hypothesis::has_converged);
+        self.delays.end_block(has_converged);
         self.segment_s += block_s;
         self.last_block_s = block_s;
         let prior = &self.prior;
@@ -552,6 +574,7 @@ impl Identification {
         self.wheel_noise.is_noise_added = true;
         // What was identified so far took the noise for slip.
         self.prior.reset();
+        self.delays = Delays::new();
         self.robot = None;
         self.segment_s = 0.0;
         self.last_block_s = 0.0;
@@ -609,11 +632,13 @@ impl Identification {
 
     /// Returns θ of the present ground: the mean of the hypotheses' ln K weighted by their fit,
     /// with a variance that contains their disagreement. None before [`BLOCKS_MIN`] blocks, if
-    /// residuals are too large for the model, or if those of the newest blocks are much larger than before.
+    /// residuals are too large for the model, if those of the newest blocks are much larger than before,
+    /// or if a sensor is late.
     pub(super) fn identified(&self) -> Option<Identified> {
         let best = self.best()?;
         let is_known = best.age() >= BLOCKS_MIN && best.is_determined();
-        if !is_known || self.misfit_ratio().is_some() || self.newest_misfit_ratio().is_some() {
+        let fits = self.misfit_ratio().is_none() && self.newest_misfit_ratio().is_none();
+        if !is_known || !fits || self.late_sensor().is_some() {
             return None;
         }
         let least = self.least_cost();
@@ -662,6 +687,13 @@ impl Identification {
     pub(super) fn newest_misfit_ratio(&self) -> Option<f64> {
         let best = self.best()?;
         self.fit.misfit_ratio().filter(|_| best.has_converged())
+    }
+
+    /// Returns the delays of gyro and accelerometer, where they are too large to be identified, or differ
+    /// from those of the estimate or of earlier blocks. None before [`BLOCKS_MIN`] blocks.
+    pub(super) fn late_sensor(&self) -> Option<LateSensor> {
+        let best = self.best().filter(|best| best.age() >= BLOCKS_MIN)?;
+        self.delays.late(best.values())
     }
 
     /// Returns the newest estimate of the robot's own parameters, of this ground or an earlier one.

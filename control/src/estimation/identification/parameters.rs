@@ -2,6 +2,7 @@
 
 use nalgebra::{SMatrix, SVector};
 
+use super::curve_prior::CurvePrior;
 use super::dual::{Dual, Real};
 use crate::estimation::{EstimatorPrior, SensorNoise};
 use crate::robot::RobotModel;
@@ -92,6 +93,8 @@ pub(super) struct Prior {
     pub(super) std_devs: Values,
     /// Mean of the initial prior, the middle of each parameter's range.
     pub(super) first_mean: Values,
+    /// Standard deviation of the bend that intervals assume.
+    pub(super) interval_bend_std_dev: f64,
 }
 
 impl Prior {
@@ -227,19 +230,13 @@ pub(super) const OF_LOAD_AND_GROUND: [usize; 15] = [
 
 /// Mean and standard deviation of ln K: ground from wet ice to asphalt.
 const LN_STIFFNESS: (f64, f64) = (1.1, 2.0);
-/// Mean and standard deviation of ln `μ_p`.
-const LN_PEAK: (f64, f64) = (-0.6, 0.4);
-/// Means and standard deviations of the curve's shape, `1/n` and `a`.
+/// Mean and standard deviation of the curve's `1/n`.
 const SHAPE: (f64, f64) = (0.3, 0.2);
-const BEND: (f64, f64) = (0.3, 0.45);
 /// Mean and standard deviation of the part of practical slip.
 const PRACTICAL_SLIP: (f64, f64) = (0.25, 0.35);
 /// Mean, standard deviation and maximum of the relaxation length's decrease.
 const RELAXATION_DECREASE: (f64, f64) = (0.3, 0.35);
 const RELAXATION_DECREASE_MAX: f64 = 1.5;
-/// Standard deviation of the bend that intervals assume, wider than that of the estimate's prior: a
-/// lumped `LuGre` contact has the bend 1, with n = 2.
-pub(super) const INTERVAL_BEND_STD_DEV: f64 = 0.6;
 /// Minimum of `1/n`, at which the curve is practically straight up to its peak.
 pub(super) const SHAPE_MIN: f64 = 0.05;
 /// Standard deviation of the centre of mass's forward position, relative to the wheelbase.
@@ -267,11 +264,12 @@ const ACCELEROMETER_DELAY_STD_DEV_S: f64 = 0.010;
 /// Range in which parameters stay, in standard deviations of their initial prior.
 const PRIOR_RANGE: f64 = 5.0;
 /// Minimum standard deviation, used where the configuration gives 0.
-const STD_DEV_MIN: f64 = 1.0e-4;
+pub(super) const STD_DEV_MIN: f64 = 1.0e-4;
 
 /// Returns the initial prior, before any measurement.
 pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
     let tyres = &prior.tyres;
+    let curve = CurvePrior::of(tyres);
     let payload = 1.0 + prior.model.payload_ratio;
     // Variance of the logarithm of a log-normal distribution with that mean and standard deviation.
     let spread = (1.0 + (tyres.relaxation_std_dev_m / tyres.relaxation_m).powi(2)).ln();
@@ -315,9 +313,9 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
             index::RADIUS_DIFFERENCE,
             (0.0, noise.radius_ratio * std::f64::consts::SQRT_2),
         ),
-        (index::PEAK, LN_PEAK),
+        (index::PEAK, curve.peak),
         (index::SHAPE, SHAPE),
-        (index::BEND, BEND),
+        (index::BEND, curve.bend),
         (index::PRACTICAL_SLIP, PRACTICAL_SLIP),
         (index::RELAXATION_DECREASE, RELAXATION_DECREASE),
         (index::GYRO_OFFSET, (0.0, noise.gyro_offset_rad_s)),
@@ -340,6 +338,7 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
         information_vector: Values::zeros(),
         std_devs: Values::zeros(),
         first_mean: Values::zeros(),
+        interval_bend_std_dev: curve.interval_bend_std_dev,
     };
     for (place, (mean, std_dev)) in table {
         initial.first_mean[place] = mean;

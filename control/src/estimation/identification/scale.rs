@@ -10,7 +10,7 @@
 
 use super::blocks::{Blocks, add_outer_square, multiply};
 use super::model::CHANNELS;
-use super::parameters::{INTERVAL_BEND_STD_DEV, Prior, Square, Values, index};
+use super::parameters::{Prior, Square, Values, index};
 
 /// Fraction of its information that a block loses with each later block, because sensor offsets
 /// drift.
@@ -337,13 +337,13 @@ impl TimeScale {
     }
 
     /// Returns the increase of the variance of ln K if the bend of the friction curve has the standard
-    /// deviation [`INTERVAL_BEND_STD_DEV`] instead of that of the prior.
+    /// deviation that intervals assume instead of that of the prior.
     ///
     /// An error e of a prior mean with the standard deviation σ is an error `C_b e / σ²` of ln K,
     /// with the covariance `C_b` of both. The estimate stays, so no other error changes.
     pub(super) fn bend_variance_inflation(&self, prior: &Prior) -> f64 {
         let assumed = prior.std_devs[index::BEND].powi(2);
-        let added = (INTERVAL_BEND_STD_DEV.powi(2) - assumed).max(0.0);
+        let added = (prior.interval_bend_std_dev.powi(2) - assumed).max(0.0);
         (self.stiffness_covariance[index::BEND] / assumed).powi(2) * added
     }
 

@@ -16,6 +16,7 @@ impl Identification {
         }
         self.segment_s = (self.segment_s - std::mem::take(&mut self.last_block_s)).max(0.0);
         self.fit.drop_block();
+        self.delays.drop_block();
         self.block_s = 0.0;
         self.is_moving = false;
     }

@@ -186,4 +186,9 @@ impl ChannelOutput {
     pub(super) fn value(&self) -> f64 {
         self.output.value
     }
+
+    /// Returns its slope with respect to one parameter.
+    pub(super) fn slope(&self, place: usize) -> f64 {
+        self.output.slopes[place]
+    }
 }

@@ -3,6 +3,7 @@
 use super::parameters::{Number, Robot, Values};
 use super::tests::{SAMPLE_S, Simulated, identification};
 use super::*;
+use crate::estimation::TyrePrior;
 
 /// Drives for a minute, without torque sensors.
 fn drive_without_torque(identification: &mut Identification, robot: &mut Simulated) {
@@ -63,6 +64,58 @@ fn slip_relaxation_length_and_motion_resistance_that_are_others_are_identified()
             "parameter {place}: {error}, without it {assumed}"
         );
     }
+}
+
+/// ln(θ̂/θ) of a robot on ground of K 2 whose tyres are those of a brush with a peak of 0.9, and its standard
+/// deviation, with an estimator that is configured for these `tyres`.
+fn identified_on_a_brush(tyres: TyrePrior) -> (f64, f64) {
+    let mut robot = Simulated::new(|values| {
+        values[index::STIFFNESS] = 2.0_f64.ln();
+        values[index::PEAK] = 0.9_f64.ln();
+        values[index::BEND] = 1.0 / 3.0;
+        values[index::SHAPE] = 1.0 / 3.0;
+    });
+    let prior = EstimatorPrior {
+        tyres,
+        ..EstimatorPrior::default()
+    };
+    let noise = SensorNoise::default();
+    let mut identification =
+        Identification::new(RobotModel::yi2007(), &noise, &prior).expect("the tyres are uncertain");
+    for _ in 0..2_000 {
+        let sample = SensorSample {
+            wheel_torques: None,
+            ..robot.sample()
+        };
+        identification.update(&sample, &noise, SAMPLE_S);
+    }
+    let found = identification.identified().expect("θ is excited");
+    let std_dev = found
+        .own_ratio
+        .hypot(found.robot_ratio)
+        .hypot(found.tyres_ratio);
+    ((found.theta * 2.0).ln(), std_dev)
+}
+
+#[test]
+fn tyres_that_are_configured_improve_the_estimate() {
+    let unknown = TyrePrior::unknown();
+    let (error, std_dev) = identified_on_a_brush(unknown);
+    assert!(error.abs() < 1.96 * std_dev, "{error} {std_dev}");
+    let (known_error, known_std_dev) = identified_on_a_brush(TyrePrior {
+        curvature: 1.0 / 2.7,
+        curvature_std_dev: 0.2,
+        mu_max: Some(0.4),
+        ..unknown
+    });
+    assert!(
+        known_error.abs() < 1.96 * known_std_dev,
+        "{known_error} {known_std_dev}"
+    );
+    assert!(
+        known_error.abs() < 0.5 * error.abs(),
+        "{known_error} {error}"
+    );
 }
 
 #[test]

@@ -30,7 +30,7 @@ use tread_lab::rough::run::{ASKED_AT_S, Trial, run};
 
 use lines::{CHANGES, alone, population};
 use parameters::{ParameterLine, parameter_lines};
-use score::{Drive, Line, POPULATION, strata};
+use score::{Drive, Line, POPULATION, half_width_checks, strata};
 
 #[derive(Debug, Parser)]
 #[command(name = "rough")]
@@ -152,6 +152,7 @@ fn main() -> anyhow::Result<ExitCode> {
     let checks: Vec<Check> = lines
         .iter()
         .flat_map(Line::checks)
+        .chain(half_width_checks(&lines))
         .chain(of_parameters)
         .collect();
     if arguments.json {

@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 use serde::Serialize;
 use tread_api::friction::{NORMAL_95, ThetaEstimate};
 use tread_lab::report::{Check, Part, Table, WIDE_RATIO, median, percent};
-use tread_lab::rough::run::{ASKED_AT_S, Outcome, SLIPS_MOSTLY, Trial};
+use tread_lab::rough::run::{ASKED_AT_S, Course, Outcome, SLIPS_MOSTLY, Trial};
 
 /// Goal for the coverage of a line with a single deviation and of a stratum.
 const LINE_GOAL: RangeInclusive<f64> = 0.9..=1.0;
@@ -15,6 +15,13 @@ const POPULATION_GOAL: RangeInclusive<f64> = 0.93..=0.975;
 const USEFUL_RATIO: f64 = 0.4;
 /// Goal for the median ratio of the half-width to that of the bound.
 const OVER_BOUND_GOAL: f64 = 1.5;
+/// Maximum relative half-width of the bound of a line, without and with torque, up to which the line counts
+/// for the goal of the half-widths.
+const NARROW_BOUND_RATIOS: [f64; 2] = [0.2, 0.1];
+/// Goals for the median half-width over these lines.
+const HALF_WIDTH_GOALS: [f64; 2] = [0.3, 0.15];
+/// Goals for the share of drives that end without an estimate, without and with torque.
+const ABSTAINED_GOALS: [f64; 2] = [0.3, 0.1];
 /// Index of the last estimate of a drive.
 const LAST: usize = ASKED_AT_S.len() - 1;
 /// Name of the line with all deviations.
@@ -98,8 +105,8 @@ impl Line {
         }
     }
 
-    /// Returns the checks of the line: its coverage and, if bounds were computed, width and
-    /// availability of the estimates.
+    /// Returns the checks of the line: its coverage, availability on figure-8s of the population, and, if
+    /// bounds were computed, width and availability of the estimates.
     pub(crate) fn checks(&self) -> Vec<Check> {
         let named = |what: &str| {
             let torque = if self.has_torque { "with" } else { "without" };
@@ -109,10 +116,13 @@ impl Line {
         checks.extend(self.over_bound.map(|over| {
             Check::of(named("median half-width over the bound's"), over).at_most(OVER_BOUND_GOAL)
         }));
-        let most = if self.has_torque { 0.1 } else { 0.3 };
+        let most = ABSTAINED_GOALS[usize::from(self.has_torque)];
         checks.extend(self.abstained_needlessly.map(|share| {
             Check::of(named("none after 60 s though the bound is useful"), share).at_most(most)
         }));
+        if self.name == format!("{POPULATION}, {}", Course::Figure8.text()) {
+            checks.push(Check::of(named("none after 60 s"), self.abstained_at_end).at_most(most));
+        }
         checks
     }
 
@@ -124,6 +134,35 @@ impl Line {
         };
         Check::of(name, self.coverage).between(goal)
     }
+}
+
+/// Returns the checks of the median half-width over all lines with a single deviation whose bound is narrow;
+/// none without bounds.
+pub(crate) fn half_width_checks(lines: &[Line]) -> Vec<Check> {
+    let check = |has_torque: bool| {
+        let place = usize::from(has_torque);
+        let is_narrow = |line: &&Line| {
+            line.has_torque == has_torque
+                && !line.name.starts_with(POPULATION)
+                && line.estimates > 0
+                && line
+                    .bound
+                    .is_some_and(|bound| bound <= NARROW_BOUND_RATIOS[place])
+        };
+        let mut widths: Vec<f64> = lines
+            .iter()
+            .filter(is_narrow)
+            .map(|line| line.half_width)
+            .collect();
+        let torque = if has_torque { "with" } else { "without" };
+        let name = format!(
+            "median half-width over {} lines, {torque} torque",
+            widths.len()
+        );
+        (!widths.is_empty())
+            .then(|| Check::of(name, median(&mut widths)).at_most(HALF_WIDTH_GOALS[place]))
+    };
+    [true, false].into_iter().filter_map(check).collect()
 }
 
 /// Divides the population by thirds of some deviations, by friction curve, ground, course and make,

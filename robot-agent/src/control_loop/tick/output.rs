@@ -241,6 +241,7 @@ fn mode(input: &OutputInput<'_>) -> RobotMode {
 fn no_estimate(reason: manoeuvre::NoEstimate) -> NoEstimate {
     match reason {
         manoeuvre::NoEstimate::Misfit => NoEstimate::Misfit,
+        manoeuvre::NoEstimate::LateSensor => NoEstimate::LateSensor,
         manoeuvre::NoEstimate::Short => NoEstimate::Short,
         manoeuvre::NoEstimate::Slip => NoEstimate::Slip,
         manoeuvre::NoEstimate::NoTurns => NoEstimate::NoTurns,

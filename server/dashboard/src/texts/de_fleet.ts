@@ -193,6 +193,8 @@ export const fleet: Pick<Texts, Areas> = {
     noEstimateFor: {
       misfit:
         'Die Bewegungsgleichungen beschreiben nicht, was die Sensoren messen. Fahren Sie einige Sekunden weiter, wenn der Boden eben gewechselt hat; sonst hilft tread-agent doctor.',
+      late_sensor:
+        'Drehraten- oder Beschleunigungssensor ist verspätet, oder seine Verspätung hat sich geändert. Fahren Sie einige Sekunden weiter, wenn der Boden eben gewechselt hat; sonst prüfen Sie Zeitstempel und Filter von Raddrehzahlen und Inertialsensor.',
       short: 'Der Roboter ist auf diesem Boden zu wenig gefahren. Fahren Sie 20 s oder länger ohne Pause.',
       slip: 'Der Schlupf der Räder liegt außerhalb des Bereichs, in dem aus ihm die Reibung folgt. Fahren Sie größere Bögen, langsamer, und drehen Sie nicht auf der Stelle.',
       no_turns: 'Der Roboter fuhr kaum Bögen. Fahren Sie welche nach beiden Seiten, etwa eine Acht.',

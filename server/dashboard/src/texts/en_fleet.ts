@@ -194,6 +194,8 @@ export const fleet = {
     noEstimateFor: {
       misfit:
         'The equations of motion do not describe what the sensors measure. Drive on for some seconds if the ground has just changed; otherwise run tread-agent doctor.',
+      late_sensor:
+        'The gyro or the accelerometer is late, or its delay has changed. Drive on for some seconds if the ground has just changed; otherwise check the time stamps and filters of wheel speeds and inertial unit.',
       short: 'The robot has driven too little on this ground. Drive for 20 s or more without a break.',
       slip: 'The wheels slip beyond the range in which friction follows from slip. Turn in wider arcs, more slowly, and not on the spot.',
       no_turns: 'The robot drove hardly any arcs. Drive some to both sides, as in a figure-8.',
