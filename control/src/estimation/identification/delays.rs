@@ -4,7 +4,7 @@
 //! moves them slowly, since earlier blocks outweigh new ones, and meanwhile K takes the rest, because a late
 //! response looks like slip. The newest blocks alone show the delay at once: a sensor that is late by δ
 //! leaves residuals of −δ times the rate of change of its output. Their delay is compared with the
-//! identified one, and with that of all earlier blocks of the drive.
+//! identified one, and with that of about the last minute of earlier blocks.
 
 use super::parameters::{Values, index};
 use super::simulation::{DELAYED, delays_s};
@@ -26,8 +26,8 @@ const CHANGED: Difference = Difference {
 };
 /// Number of newest blocks that are taken together.
 const NEWEST: usize = 5;
-/// Minimum number of earlier blocks, and the number in which they are forgotten, so that a delay that has
-/// changed for good becomes the usual one after a minute.
+/// Minimum number of earlier blocks, and the number above which older ones lose weight exponentially, so that
+/// a delay that has changed for good becomes the usual one after about a minute.
 const EARLIER_MIN: u32 = 5;
 const EARLIER_MAX: u32 = 60;
 /// Maximum magnitude of a standardised residual.
