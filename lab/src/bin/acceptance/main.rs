@@ -5,8 +5,7 @@
 //!
 //! Runs the report programs one after the other, each on all cores and with the first seeds of its page in
 //! `docs/reports`, and summarises their checks by requirement. A program that fails is a check that does not
-//! hold. The programs must have been built; their folder
-//! is that of this program.
+//! hold. The programs must have been built; their folder is that of this program.
 
 #![expect(clippy::print_stdout, reason = "a program that prints a report")]
 
@@ -22,7 +21,7 @@ use serde_json::json;
 use tread_lab::report::{Check, Table, checks_json, checks_markdown, page_markdown};
 
 use programs::{PROGRAMS, Program, Run, now};
-use requirements::{Summary, forgotten_check, summaries};
+use requirements::{Summary, missing_figures_check, summaries};
 
 /// Maximum duration of all programs on two cores, minutes.
 const MINUTES_MAX: f64 = 60.0;
@@ -45,7 +44,7 @@ struct Arguments {
     #[arg(long, value_name = "FOLDER")]
     reports: Option<PathBuf>,
     /// Summarise the reports in this folder, which `--reports` wrote, instead of running the programs
-    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["reports"])]
+    #[arg(long, value_name = "FOLDER", conflicts_with = "reports")]
     summarise: Option<PathBuf>,
     /// Print one JSON object instead of tables
     #[arg(long, conflicts_with = "markdown")]
@@ -101,7 +100,7 @@ fn main() -> anyhow::Result<ExitCode> {
     let duration = arguments.summarise.is_none().then_some(duration);
     let summaries = summaries(&runs);
     let mut checks: Vec<Check> = runs.iter().flat_map(Run::named_checks).collect();
-    checks.push(forgotten_check(&summaries));
+    checks.push(missing_figures_check(&summaries));
     checks.extend(duration.clone());
     for missed in checks.iter().filter(|check| !check.holds) {
         let (name, goal, value) = (&missed.name, &missed.goal, missed.figure(3));

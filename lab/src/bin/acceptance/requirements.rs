@@ -152,8 +152,8 @@ pub(crate) fn summaries(runs: &[Run]) -> Vec<Summary> {
         .collect()
 }
 
-/// Returns a check that each requirement has figures: one whose figures have other names would be forgotten.
-pub(crate) fn forgotten_check(summaries: &[Summary]) -> Check {
+/// Returns a check that each requirement has figures, so that a program that renames its checks is noticed.
+pub(crate) fn missing_figures_check(summaries: &[Summary]) -> Check {
     let without = summaries.iter().filter(|summary| summary.figures == 0);
     #[expect(clippy::cast_precision_loss, reason = "at most twenty")]
     let count = without.count() as f64;
@@ -236,11 +236,8 @@ mod tests {
         assert_eq!(figures("own parameters"), (1, 1));
         assert_eq!(found[0].lowest.zip(found[0].highest), Some((0.96, 0.97)));
         assert_eq!(found[0].goals, ["≥ 0.9"]);
-        let forgotten = forgotten_check(&found);
-        assert!(
-            !forgotten.holds && forgotten.value == Some(4.0),
-            "{forgotten:?}"
-        );
+        let missing = missing_figures_check(&found);
+        assert!(!missing.holds && missing.value == Some(4.0), "{missing:?}");
     }
 
     #[test]
