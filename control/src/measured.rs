@@ -4,6 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Pose, Twist};
 
+/// Random walk of a gyro's offset, radians per second per square root of a second: that of inexpensive
+/// MEMS gyros.
+pub(crate) const GYRO_OFFSET_WALK: f64 = 2.0e-4;
+
 /// Angular speeds of the wheels per side; positive drives forward.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct WheelSpeeds {

@@ -15,6 +15,14 @@ impl Random {
         Self(ChaCha8Rng::seed_from_u64(seed))
     }
 
+    /// Returns the start of another sequence of the same seed, so that a new draw does not change the others.
+    #[must_use]
+    pub fn stream(&self, number: u64) -> Self {
+        let mut own = self.0.clone();
+        own.set_stream(number);
+        Self(own)
+    }
+
     /// Returns a uniformly distributed number in `range`.
     pub fn uniform(&mut self, range: Range<f64>) -> f64 {
         range.start + (range.end - range.start) * self.0.random::<f64>()

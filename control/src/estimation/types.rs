@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::manoeuvre::NoEstimate;
-use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use crate::measured::{BodyAcceleration, GYRO_OFFSET_WALK, WheelSpeeds, WheelTorques};
 
 /// Errors of the sensors: standard deviations of white noise per sample, unless stated otherwise.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -30,6 +30,13 @@ pub struct SensorNoise {
     pub radius_ratio: f64,
     /// Standard deviation of the gyro's constant offset, radians per second.
     pub gyro_offset_rad_s: f64,
+    /// Random walk of that offset, radians per second per square root of a second.
+    #[serde(default = "usual_gyro_offset_walk")]
+    pub gyro_offset_walk: f64,
+}
+
+fn usual_gyro_offset_walk() -> f64 {
+    GYRO_OFFSET_WALK
 }
 
 impl Default for SensorNoise {
@@ -45,6 +52,7 @@ impl Default for SensorNoise {
             torque_gain_ratio: 0.02,
             radius_ratio: 0.0115,
             gyro_offset_rad_s: 0.002,
+            gyro_offset_walk: GYRO_OFFSET_WALK,
         }
     }
 }

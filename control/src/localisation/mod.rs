@@ -14,7 +14,9 @@
 //! ```
 //!
 //! **Measurement model**: a fix is `(x, y, φ) + noise` at an earlier time. It is propagated over
-//! its age with the present twist. Its covariance is the stated one, or else estimated from the
+//! its age with the measured motion since then (`past_motion.rs`), so it also depends on the errors
+//! of that motion: on `δ_v`, `v_l` and b times the age, and on their change within it, which adds to its
+//! noise. Its covariance is the stated one, or else estimated from the
 //! differences of consecutive fixes (`fix_noise.rs`), starting with the configured one. A χ² gate
 //! on the Mahalanobis distance refuses outliers and counts them; after [`REFUSED_MAX`] in a row the
 //! robot has been moved, and the filter restarts from the fix. The covariance update is
@@ -22,13 +24,18 @@
 //! Navigation*, 2001, chapters 5 and 10.
 
 mod fix_noise;
+mod past_motion;
+#[cfg(test)]
+mod tests;
 
-use nalgebra::{Matrix3, Matrix3x6, Matrix6, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 use crate::estimation::SensorSample;
 use crate::geometry::{Pose, Twist, wrap_angle_rad};
+use crate::measured::GYRO_OFFSET_WALK;
 use crate::robot::RobotModel;
 use fix_noise::{FixNoiseEstimate, PosePair};
+use past_motion::{PastMotion, Propagated, Step, Unmeasured};
 
 /// Number of consecutive refused fixes after which the filter restarts.
 pub const REFUSED_MAX: u32 = 20;
@@ -96,7 +103,7 @@ impl Default for LocalisationNoise {
             position_m: 0.01,
             heading_rad: 0.005,
             gyro_rad_s: 0.003,
-            gyro_offset_walk: 2.0e-4,
+            gyro_offset_walk: GYRO_OFFSET_WALK,
             speed_m_s: 0.02,
             sideways_m_s: 0.03,
             speed_memory_s: 1.0,
@@ -120,7 +127,7 @@ pub enum FixOutcome {
 }
 
 /// Extended Kalman filter of one robot's pose.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Localisation {
     model: RobotModel,
     noise: LocalisationNoise,
@@ -129,6 +136,7 @@ pub struct Localisation {
     covariance: Matrix6<f64>,
     turn_rad_s: f64,
     forward_m_s: f64,
+    past: PastMotion,
     started: bool,
     fix_age_s: f64,
     refused_in_a_row: u32,
@@ -151,6 +159,7 @@ impl Localisation {
             covariance: Matrix6::zeros(),
             turn_rad_s: 0.0,
             forward_m_s: 0.0,
+            past: PastMotion::new(),
             started: false,
             fix_age_s: f64::INFINITY,
             refused_in_a_row: 0,
@@ -234,10 +243,15 @@ impl Localisation {
         } else {
             self.invalid += 1;
         }
+        let dt_s = dt_s.min(STEP_MAX_S);
+        self.past.add(&Step {
+            time_s: dt_s,
+            turn_rad: self.turn_rad_s * dt_s,
+            forward_m: self.forward_m_s * dt_s,
+        });
         if !self.started {
             return;
         }
-        let dt_s = dt_s.min(STEP_MAX_S);
         let middle_rad = self.state[2] + 0.5 * dt_s * self.turn_rad_s;
         let (sin, cos) = middle_rad.sin_cos();
         let (forward_m_s, left_m_s) = (self.forward_m_s + self.state[3], self.state[4]);
@@ -257,9 +271,7 @@ impl Localisation {
         motion[(2, 5)] = -dt_s;
         motion[(3, 3)] = fade;
         motion[(4, 4)] = fade;
-        // Stopped wheels do not slide: the noise driving both speeds grows with the speed.
-        let moving = (self.forward_m_s.abs() + 0.2 * self.turn_rad_s.abs()).min(0.5) / 0.5;
-        let renewed = (1.0 - fade * fade) * (0.05 + 0.95 * moving).powi(2);
+        let renewed = (1.0 - fade * fade) * self.noise_share().powi(2);
         self.covariance = motion * self.covariance * motion.transpose();
         self.covariance[(2, 2)] += (self.noise.gyro_rad_s * dt_s).powi(2);
         self.covariance[(3, 3)] += renewed * self.noise.speed_m_s.powi(2);
@@ -293,7 +305,7 @@ impl Localisation {
             self.invalid += 1;
             return FixOutcome::Invalid;
         }
-        let pose = self.propagated(fix);
+        let Propagated { pose, observe } = self.propagated(fix);
         if let Some(filter) = self.pose().filter(|_| fix.noise.is_none()) {
             self.fix_noise.compare(PosePair { fix: pose, filter });
         }
@@ -307,8 +319,7 @@ impl Localisation {
             pose.y_m - self.state[1],
             wrap_angle_rad(pose.heading_rad - self.state[2]),
         );
-        let observe = Matrix3x6::identity();
-        let position = fix_noise.position_m.powi(2);
+        let position = fix_noise.position_m.powi(2) + self.drift_m2(fix.age_s);
         let noise = Matrix3::from_diagonal(&Vector3::new(
             position,
             position,
@@ -348,17 +359,34 @@ impl Localisation {
         }
     }
 
-    /// Propagates the fix over its age with the present motion.
-    fn propagated(&self, fix: &PositionFix) -> Pose {
-        let turn_rad = self.turn_rad_s * fix.age_s;
-        let (sin, cos) = (fix.pose.heading_rad + 0.5 * turn_rad).sin_cos();
-        let forward_m = (self.forward_m_s + self.state[3]) * fix.age_s;
-        let left_m = self.state[4] * fix.age_s;
-        Pose {
-            x_m: fix.pose.x_m + forward_m * cos - left_m * sin,
-            y_m: fix.pose.y_m + forward_m * sin + left_m * cos,
-            heading_rad: fix.pose.heading_rad + turn_rad,
-        }
+    /// Propagates the fix over its age with the measured motion.
+    fn propagated(&self, fix: &PositionFix) -> Propagated {
+        let unmeasured = Unmeasured {
+            forward_m_s: self.state[3],
+            left_m_s: self.state[4],
+        };
+        let rates = Step {
+            time_s: 1.0,
+            turn_rad: self.turn_rad_s,
+            forward_m: self.forward_m_s,
+        };
+        self.past.propagate(fix.pose, fix.age_s, unmeasured, &rates)
+    }
+
+    /// Returns the share of the noise that drives the unmeasured speeds, 0 to 1: stopped wheels do not slide,
+    /// so it grows with the speed.
+    fn noise_share(&self) -> f64 {
+        let moving = (self.forward_m_s.abs() + 0.2 * self.turn_rad_s.abs()).min(0.5) / 0.5;
+        0.05 + 0.95 * moving
+    }
+
+    /// Returns the variance of the way since a fix by changes of the unmeasured speeds within its age a, in
+    /// square metres: with the density q of the noise that drives them, `q a³/3` on each axis.
+    fn drift_m2(&self, age_s: f64) -> f64 {
+        let noise = &self.noise;
+        let std_dev_m_s = noise.speed_m_s.max(noise.sideways_m_s) * self.noise_share();
+        let square = std_dev_m_s * std_dev_m_s;
+        2.0 * square / noise.speed_memory_s.max(age_s) * age_s.powi(3) / 3.0
     }
 
     fn start(&mut self, pose: Pose, age_s: f64, fix_noise: FixNoise) {
@@ -383,118 +411,5 @@ impl Localisation {
         self.refused_in_a_row = 0;
         self.fix_age_s = age_s;
         self.anchor(pose);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn filter() -> Localisation {
-        Localisation::new(RobotModel::yi2007(), LocalisationNoise::default())
-    }
-
-    fn fix(x_m: f64, y_m: f64) -> PositionFix {
-        PositionFix {
-            pose: Pose {
-                x_m,
-                y_m,
-                heading_rad: 0.0,
-            },
-            age_s: 0.0,
-            noise: None,
-        }
-    }
-
-    fn straight(speed_rad_s: f64) -> SensorSample {
-        SensorSample {
-            wheel_speeds: crate::measured::WheelSpeeds {
-                left_rad_s: speed_rad_s,
-                right_rad_s: speed_rad_s,
-            },
-            ..SensorSample::default()
-        }
-    }
-
-    #[test]
-    fn nothing_is_known_before_the_first_fix() {
-        let mut filter = filter();
-        filter.predict(&SensorSample::default(), 0.01);
-        assert!(filter.pose().is_none() && filter.fix_age_s().is_infinite());
-        assert_eq!(filter.correct(&fix(1.0, 2.0)), FixOutcome::Started);
-        assert!((filter.pose().unwrap().x_m - 1.0).abs() < 1.0e-12);
-    }
-
-    #[test]
-    fn a_fix_that_cannot_be_true_is_refused_until_it_insists() {
-        let mut filter = filter();
-        filter.correct(&fix(0.0, 0.0));
-        for _ in 1..REFUSED_MAX {
-            filter.predict(&SensorSample::default(), 0.05);
-            assert_eq!(filter.correct(&fix(50.0, 0.0)), FixOutcome::Outlier);
-            assert!(filter.pose().unwrap().x_m.abs() < 0.01);
-        }
-        filter.predict(&SensorSample::default(), 0.05);
-        assert_eq!(filter.correct(&fix(50.0, 0.0)), FixOutcome::Restarted);
-        assert!((filter.pose().unwrap().x_m - 50.0).abs() < 1.0e-9);
-    }
-
-    #[test]
-    fn after_a_silence_a_fix_is_believed_as_far_as_the_robot_can_have_come() {
-        let speed_m_s = 0.5;
-        let speed_rad_s = speed_m_s / RobotModel::yi2007().wheel_radius_m();
-        let driven = |is_silence_known: bool, speed_rad_s: f64, jump_m: f64| {
-            let mut filter = filter();
-            filter.correct(&fix(0.0, 0.0));
-            for _ in 0..20 {
-                filter.predict(&straight(speed_rad_s), 0.05);
-                let x_m = filter.pose().unwrap().x_m;
-                filter.correct(&fix(x_m, 0.0));
-            }
-            let x_m = filter.pose().unwrap().x_m;
-            if is_silence_known {
-                filter.widen_without_measurements(1.5);
-            }
-            filter.predict(&straight(0.0), 0.2);
-            filter.correct(&fix(x_m + jump_m, 0.0))
-        };
-        assert_eq!(driven(true, speed_rad_s, 0.3), FixOutcome::Fused);
-        assert_eq!(driven(false, speed_rad_s, 0.3), FixOutcome::Outlier);
-        assert_eq!(driven(true, speed_rad_s, 50.0), FixOutcome::Outlier);
-        assert_eq!(driven(true, 0.0, 0.3), FixOutcome::Outlier);
-    }
-
-    #[test]
-    fn a_fix_weighs_by_its_own_standard_deviation() {
-        let moved_by = |position_m: f64| {
-            let mut filter = filter();
-            filter.correct(&fix(0.0, 0.0));
-            filter.predict(&SensorSample::default(), 0.05);
-            let mut fix = fix(0.02, 0.0);
-            fix.noise = Some(FixNoise {
-                position_m,
-                heading_rad: 0.01,
-            });
-            let outcome = filter.correct(&fix);
-            (outcome, filter.pose().unwrap().x_m)
-        };
-        let (_, by_good) = moved_by(0.005);
-        let (_, by_poor) = moved_by(0.1);
-        assert!(by_good > 0.015 && by_poor < 0.001, "{by_good} {by_poor}");
-        assert_eq!(moved_by(f64::NAN).0, FixOutcome::Invalid);
-        assert_eq!(moved_by(0.0).0, FixOutcome::Invalid);
-    }
-
-    #[test]
-    fn samples_that_are_no_numbers_are_counted_and_do_no_harm() {
-        let mut filter = filter();
-        filter.correct(&fix(0.0, 0.0));
-        let mut sample = straight(f64::INFINITY);
-        sample.gyro_rad_s = f64::NAN;
-        filter.predict(&sample, 0.01);
-        assert_eq!(filter.correct(&fix(f64::NAN, 0.0)), FixOutcome::Invalid);
-        assert_eq!(filter.invalid(), 3);
-        assert!(filter.pose().unwrap().is_finite());
-        assert!((filter.fix_age_s() - 0.01).abs() < 1.0e-12);
     }
 }

@@ -33,8 +33,9 @@ pub fn drawn(seed: u64, has_torque: bool) -> Trial {
     let width = Width::new(WIDTH).unwrap_or_default();
     let make = random.one_of(&MAKES).unwrap_or(MAKES[0]);
     let mut deviations = Deviations::drawn_wider(&mut random, width);
-    // ODE's own contacts: force-dependent slip up to a limit.
+    // ODE's own contacts: force-dependent slip up to a limit, alike in both directions.
     deviations.curve.shape = Shape::Linear;
+    deviations.lateral_stiffness_ratio = 1.0;
     let mut trial = Trial {
         make,
         deviations,

@@ -38,7 +38,7 @@ type Parameter = (f64, fn(&mut Deviations, f64));
 
 /// Parameters with the standard deviations of [`Deviations::drawn`]; that of a uniform distribution
 /// is its range over √12.
-const PARAMETERS: [Parameter; 18] = [
+const PARAMETERS: [Parameter; 19] = [
     // ln K over three grounds; it must be the first parameter.
     (1.16, |robot, by| robot.curve.stiffness *= by.exp()),
     (0.0866, |robot, by| robot.payload_ratio += by),
@@ -62,6 +62,9 @@ const PARAMETERS: [Parameter; 18] = [
     (0.005, |robot, by| robot.radius_ratio[0] += by),
     (0.005, |robot, by| robot.radius_ratio[1] += by),
     (0.173, |robot, by| robot.curve.mu_peak += by),
+    (0.13, |robot, by| {
+        robot.lateral_stiffness_ratio *= by.exp();
+    }),
 ];
 /// Number of shapes other than the robot's own.
 const OTHERS: usize = Shape::ALL.len() - 1;

@@ -3,8 +3,9 @@
 //! The state is in the body frame at the centre of mass: forward and left speed, turn rate; per side
 //! the wheel speed (front and rear are coupled by a chain, as on the robots of [`super::spec`]); per
 //! contact the deflection of the tyre as a slip vector s, with
-//! `ℓ ṡ = v_slip − |rω| s`. The contact force is `N μ(|s|) s/|s|`, with the wheel load N of a rigid
-//! body on four equal springs. Gravity acts along the slope. A proportional-integral speed servo
+//! `ℓ ṡ = v_slip − |rω| s`. The contact force is `N μ(|s'|) s'/|s'|`, with the wheel load N of a rigid
+//! body on four equal springs. `s'` is s with its lateral part multiplied by the ratio of the lateral to the
+//! longitudinal stiffness (similarity of combined slip: Pacejka, Tire and Vehicle Dynamics, ch. 4). Gravity acts along the slope. A proportional-integral speed servo
 //! commands the motor torques, which are limited. Rotor inertia, gear losses and rolling resistance
 //! reduce the torque at the contact.
 
@@ -234,7 +235,7 @@ impl Plant {
         let slips = self
             .contacts
             .iter()
-            .map(|contact| length(contact.deflection));
+            .map(|contact| length(self.felt(contact.deflection)));
         slips.fold(0.0, f64::max) / self.spec.curve.peak_slip()
     }
 
@@ -268,6 +269,11 @@ impl Plant {
     pub fn with_blend(mut self, shape: Shape, ratio: f64) -> Self {
         self.blend = Some((shape, ratio));
         self
+    }
+
+    /// Returns the deflection in whose direction the contact force acts.
+    fn felt(&self, [forward, left]: [f64; 2]) -> [f64; 2] {
+        [forward, self.spec.lateral_stiffness_ratio * left]
     }
 
     /// Returns the ratio μ/λ of the blended friction curve.
@@ -310,7 +316,8 @@ impl Plant {
         let damping =
             2.0 * DAMPING_RATIO * (curve.stiffness * self.spec.relaxation_m / GRAVITY_M_S2).sqrt();
         self.contacts.map(|contact| {
-            let slip = length(contact.deflection);
+            let felt = self.felt(contact.deflection);
+            let slip = length(felt);
             let mu_over_slip = self.mu_over_slip(ContactSlip {
                 slip,
                 sliding_m_s: contact.slip_m_s,
@@ -322,7 +329,7 @@ impl Plant {
             let most_n = curve.mu_peak * contact.load_n;
             let mut force = [0, 1].map(|axis| {
                 let gives = velocity[axis] - rim_m_s * contact.deflection[axis];
-                contact.load_n * (mu_over_slip * contact.deflection[axis] + damped * gives)
+                contact.load_n * (mu_over_slip * felt[axis] + damped * gives)
             });
             let size_n = length(force);
             if size_n > most_n {

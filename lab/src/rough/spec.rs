@@ -106,6 +106,8 @@ pub struct Deviations {
     pub center_height_ratio: f64,
     /// Relaxation length of the contacts, metres.
     pub relaxation_m: f64,
+    /// Ratio of the contacts' lateral to their longitudinal stiffness.
+    pub lateral_stiffness_ratio: f64,
     /// Slope of the ground along the site's axes `[x, y]`, radians.
     pub slope_rad: [f64; 2],
     /// Ratio of measured to true torque, `[left, right]`.
@@ -137,6 +139,7 @@ impl Deviations {
             center_left_ratio: 0.0,
             center_height_ratio: 0.3,
             relaxation_m: 2.0e-3,
+            lateral_stiffness_ratio: 1.0,
             slope_rad: [0.0; 2],
             torque_scale: [1.0; 2],
             rotor_ratio: 0.01,
@@ -156,7 +159,9 @@ impl Deviations {
     /// Draws one robot of the population.
     ///
     /// Payloads are those that data sheets allow for daily use (0 to 30 %); relaxation lengths are
-    /// those of small pneumatic and solid tyres (1 to 10 cm: Pacejka, ch. 5). Torque constants have
+    /// those of small pneumatic and solid tyres (1 to 10 cm: Pacejka, ch. 5). Carcasses are softer to the
+    /// side than along the wheel, so lateral stiffness is 0.7 to 1.1 of the longitudinal one (Pacejka, ch. 3
+    /// and 4; 1 for a brush model on a rigid carcass). Torque constants have
     /// standard deviations of 3 % for both sides together and 2 % per side (motor data sheets state
     /// ± 5 to 10 % at most). Slopes are those of yards and fields (standard deviation 2° per axis,
     /// at most 6°).
@@ -185,6 +190,9 @@ impl Deviations {
             center_left_ratio: random.uniform(width.range(-0.03..0.03)),
             center_height_ratio: random.uniform(width.range(0.2..0.5)),
             relaxation_m: random.log_uniform(width.log_range(0.01..0.1)),
+            lateral_stiffness_ratio: random
+                .stream(LATERAL_STREAM)
+                .log_uniform(width.log_range(0.7..1.1)),
             slope_rad,
             torque_scale: [
                 scale * (1.0 + random.normal(side_scale)),
@@ -205,6 +213,8 @@ impl Deviations {
     }
 }
 
+/// Random sequence of the lateral stiffness, so that all else is as it was without this draw.
+const LATERAL_STREAM: u64 = 1;
 /// Geometric middle of the grounds' stiffnesses 0.7 and 12.
 const STIFFNESS_MIDDLE: Middle = Middle(2.898);
 /// Least inertia of a side's rotors and wheels at the rim, relative to half the mass: that of the

@@ -102,6 +102,7 @@ pub fn run(size: Size) -> anyhow::Result<Report> {
 fn fellow(random: &mut Random, ground: &Deviations) -> Deviations {
     Deviations {
         relaxation_m: ground.relaxation_m,
+        lateral_stiffness_ratio: ground.lateral_stiffness_ratio,
         slope_rad: ground.slope_rad,
         rolling_resistance_ratio: ground.rolling_resistance_ratio,
         curve: ground.curve,

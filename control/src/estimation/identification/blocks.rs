@@ -1,6 +1,7 @@
 //! Sums over linearised blocks of measurements.
 
 use super::parameters::{PARAMETERS, Square, Values};
+use super::random_walk::RandomWalk;
 
 /// Weighted sums over linearised blocks of measurements.
 #[derive(Debug, Clone, PartialEq)]
@@ -47,6 +48,11 @@ impl Blocks {
             other.information_vector.as_slice(),
         );
         self.count = combine(self.count, other.count);
+    }
+
+    /// Adds a random walk of a parameter since these blocks.
+    pub(super) fn add_walk(&mut self, walk: &RandomWalk) {
+        walk.add_to(&mut self.information, &mut self.information_vector);
     }
 
     /// Adds the sums of other blocks.

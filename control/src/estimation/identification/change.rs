@@ -9,7 +9,8 @@
 //! their difference small.
 
 use super::model::{CHANNELS, Input, State};
-use super::parameters::{MODELLED, Robot, Values, index};
+use super::parameters::{MODELLED, Values, index};
+use super::physical::Robot;
 use super::simulation::{DELAYED, Simulation, delays_s};
 use crate::robot::RobotModel;
 

@@ -25,8 +25,9 @@
 
 use super::fast_changes::FastChanges;
 use super::model::{CHANNELS, Input, State};
-use super::parameters::{Number, Prior, Robot, Values, index};
-use super::scale::{ChannelResidual, Residual, TimeScale, ln_stiffness_gradient};
+use super::parameters::{Number, Prior, Values, index, ln_stiffness_gradient};
+use super::physical::Robot;
+use super::scale::{BlockEnd, ChannelResidual, Residual, TimeScale};
 use super::scales::TimeScales;
 use super::simulation::{ChannelOutput, Predicted, Simulation, delays_s};
 use crate::robot::RobotModel;
@@ -298,14 +299,14 @@ impl Hypothesis {
 
     /// Ends the open block and takes a bounded Gauss–Newton step from all blocks of the ground and
     /// the prior. Returns false if a parameter is not finite.
-    pub(super) fn end_block(&mut self, prior: &Prior) -> bool {
+    pub(super) fn end_block(&mut self, prior: &Prior, end: &BlockEnd) -> bool {
         let values = self.values;
         self.last_weight_factor = 1.0;
         self.fast.end_block();
         self.age = self.age.saturating_add(1);
         self.cost *= COST_DECAY;
         let has_converged = self.has_converged();
-        let Some(solution) = self.scales.end_block(&values, prior, has_converged) else {
+        let Some(solution) = self.scales.end_block(&values, prior, end, has_converged) else {
             // The same values are used until the equations can be solved.
             return true;
         };
@@ -344,6 +345,12 @@ impl Hypothesis {
             self.fast.clear();
         }
         self.values.iter().all(|value| value.is_finite())
+    }
+
+    /// Does a part of the work that the end of the last block left, about as long as a solution of the
+    /// normal equations.
+    pub(super) fn continue_deferred(&mut self, prior: &Prior) {
+        self.scales.continue_deferred(prior);
     }
 
     /// Solves the equations that were deferred at the end of the last block.

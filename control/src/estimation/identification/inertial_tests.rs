@@ -93,3 +93,33 @@ fn gravity_in_the_acceleration_is_no_misfit_on_a_slope() {
         assert!(best.worst_square() < 2.0, "{}", best.worst_square());
     }
 }
+
+/// Returns the estimated offset of the gyro, radians per second, after a minute in which it grew steadily by
+/// `grown_rad_s`.
+fn offset_after_drift(noise: &SensorNoise, grown_rad_s: f64) -> f64 {
+    let mut robot = Simulated::new(|_| {});
+    let prior = EstimatorPrior::default();
+    let mut identification = Identification::new(RobotModel::yi2007(), noise, &prior)
+        .expect("the default prior is uncertain");
+    for tick in 1..=6_000 {
+        let mut sample = robot.sample();
+        sample.gyro_rad_s += grown_rad_s * f64::from(tick) / 6_000.0;
+        identification.update(&sample, noise, SAMPLE_S);
+    }
+    let best = identification.best().expect("it drove");
+    best.values()[index::GYRO_OFFSET]
+}
+
+#[test]
+fn an_offset_of_the_gyro_that_drifts_is_followed() {
+    let grown_rad_s = 0.003;
+    let walking = SensorNoise::default();
+    let constant = SensorNoise {
+        gyro_offset_walk: 0.0,
+        ..walking
+    };
+    let [followed, averaged] =
+        [walking, constant].map(|noise| offset_after_drift(&noise, grown_rad_s));
+    assert!((followed - grown_rad_s).abs() < 7.0e-4, "{followed}");
+    assert!((averaged - grown_rad_s).abs() > 9.0e-4, "{averaged}");
+}

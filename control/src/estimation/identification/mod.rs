@@ -4,7 +4,7 @@
 //! The rows of the other modules are linear in θ for small slip and average over blocks, which is
 //! exact for a robot that equals its model. For other robots they use a small part of the
 //! measurements, and give no estimate beyond small slip. This module simulates the equations of
-//! motion ([`model`]) with the measured wheel speeds as input, and estimates all 28 unknown
+//! motion ([`model`]) with the measured wheel speeds as input, and estimates all 29 unknown
 //! parameters ([`parameters`]) at once from the other sensors ([`hypothesis`]). The problem is
 //! nonlinear, so three estimators start at different values of K; those that fit worse are
 //! discarded.
@@ -23,7 +23,10 @@ mod model;
 #[cfg(test)]
 mod outlier_tests;
 mod parameters;
+mod physical;
+mod random_walk;
 mod recent;
+mod regimes;
 mod robot;
 mod scale;
 mod scales;
@@ -47,6 +50,9 @@ use fit::Fit;
 use hypothesis::{Hypothesis, Measured};
 use model::{CHANNELS, Input, State, gravity_m_s2};
 use parameters::{Prior, index};
+use random_walk::RandomWalk;
+use regimes::BlockMotion;
+use scale::BlockEnd;
 use simulation::delays_s;
 use wheel_noise::WheelNoise;
 
@@ -87,8 +93,10 @@ const MODEL_TORQUE_MU: f64 = 0.025;
 /// the model's equations: a relative one, of ln θ, and an absolute one, of θ, which is a slip per
 /// friction coefficient and dominates where θ is small: without and with measured torque, which
 /// shows some of what the equations miss.
-const MODEL_LN_THETA_STD_DEV: f64 = 0.045;
+const MODEL_LN_THETA_STD_DEV: f64 = 0.042;
 const MODEL_THETA_STD_DEVS: [f64; 2] = [0.010, 0.008];
+/// Maximum time of one gap in which the gyro's offset drifts, seconds.
+const DRIFTED_MAX_S: f64 = 3_600.0;
 /// Minimum duration of the block with which a segment ends, seconds; a shorter one is not used.
 const SHORT_BLOCK_S: f64 = 0.5;
 /// Minimum of the mean square of a channel's standardised residuals in its weights, without and
@@ -108,9 +116,9 @@ pub(super) struct Identified {
     pub(super) own_ratio: f64,
     /// Part from the prior of the robot's other parameters; common to all estimates of the robot.
     pub(super) robot_ratio: f64,
-    /// Part from the prior of the tyres, from a bend of the friction curve outside its prior, and
-    /// from tyres and ground that do not follow the model's equations; common to all robots with
-    /// these tyres.
+    /// Part from the prior of the tyres, from a bend of the friction curve outside its prior, from
+    /// tyres and ground that do not follow the model's equations, and from regimes of motion that
+    /// disagree for that reason; common to all robots with these tyres.
     pub(super) tyres_ratio: f64,
     /// Part of `tyres_ratio` from the prior of the tyres alone.
     pub(super) tyre_prior_ratio: f64,
@@ -142,6 +150,10 @@ pub(super) struct Identification {
     segment_s: f64,
     last_block_s: f64,
     is_moving: bool,
+    /// Motion of the wheels in the open block.
+    block_motion: BlockMotion,
+    /// Time since the last complete block, in which the offset of the gyro drifted, seconds.
+    drifted_s: f64,
     robot: Option<IdentifiedRobot>,
     is_robot_due: bool,
     change: ChangeMonitor,
@@ -191,6 +203,8 @@ impl Identification {
             segment_s: 0.0,
             last_block_s: 0.0,
             is_moving: false,
+            block_motion: BlockMotion::default(),
+            drifted_s: 0.0,
             robot: None,
             is_robot_due: false,
             change: ChangeMonitor::default(),
@@ -272,6 +286,7 @@ impl Identification {
         self.clear_sums();
         self.block_s = 0.0;
         self.is_moving = false;
+        self.block_motion = BlockMotion::default();
     }
 
     /// Returns the sample with its acceleration without gravity, by the estimated slope.
@@ -305,6 +320,7 @@ impl Identification {
         noise: &SensorNoise,
         time_s: f64,
     ) -> bool {
+        self.drifted_s += time_s.min(DRIFTED_MAX_S);
         if time_s > GAP_MAX_S {
             self.interrupt();
         } else {
@@ -361,14 +377,18 @@ impl Identification {
             wheels_rad_s2: [0, 1].map(|side| wheels_rad_s2[side] + rises[side]),
             ..input
         });
-        let rims_m_s = wheels_rad_s.map(|speed| speed.abs() * self.model.wheel_radius_m());
+        let rims_m_s = wheels_rad_s.map(|speed| speed * self.model.wheel_radius_m());
+        self.block_motion.add(rims_m_s);
+        let rims_m_s = rims_m_s.map(f64::abs);
         self.is_moving |= rims_m_s[0].max(rims_m_s[1]) > STANDING_M_S;
         self.add(sample, measured, rims_m_s, time_s);
         let share = time_s / COMPARED_S;
         let square_min = self.weight_square_min();
         if self.compared_s >= 0.5 * COMPARED_S {
             // In another tick than the end of the block, which takes long enough.
-            self.solve_deferred();
+            for hypothesis in &mut self.hypotheses {
+                hypothesis.continue_deferred(&self.prior);
+            }
         }
         let speed = sample.body_speed_m_s.map(|value| Measured {
             channel: CHANNELS - 1,
@@ -512,6 +532,7 @@ impl Identification {
     fn end_block(&mut self) {
         let block_s = std::mem::take(&mut self.block_s);
         let is_moving = std::mem::take(&mut self.is_moving);
+        let motion = std::mem::take(&mut self.block_motion);
         self.wheel_noise.end_block(is_moving);
         if !is_moving {
             for hypothesis in &mut self.hypotheses {
@@ -526,9 +547,15 @@ impl Identification {
         self.delays.end_block(has_converged);
         self.segment_s += block_s;
         self.last_block_s = block_s;
+        let drifted_s = std::mem::take(&mut self.drifted_s);
+        let end = BlockEnd {
+            regime: motion.regime(),
+            gyro_walk: RandomWalk::of_gyro(&self.prior, drifted_s),
+        };
+        end.gyro_walk.add_to_prior(&mut self.prior);
         let prior = &self.prior;
         self.hypotheses
-            .retain_mut(|hypothesis| hypothesis.end_block(prior));
+            .retain_mut(|hypothesis| hypothesis.end_block(prior, &end));
         if self.hypotheses.is_empty() {
             let state = self.state();
             self.begin(&state);
@@ -644,7 +671,7 @@ impl Identification {
         let least = self.least_cost();
         let cost_scale = COST_SCALE * self.residual_square();
         let (mut weights, mut mean, mut square) = (0.0, 0.0, 0.0);
-        let (mut known, mut tyres, mut bend) = (0.0, 0.0, 0.0);
+        let (mut known, mut tyres, mut bend, mut regimes) = (0.0, 0.0, 0.0, 0.0);
         for hypothesis in &self.hypotheses {
             let weight = (-(hypothesis.cost() - least) / cost_scale).exp();
             let value = hypothesis.values()[index::STIFFNESS];
@@ -655,6 +682,7 @@ impl Identification {
             known += weight * of_prior;
             tyres += weight * hypothesis.scale().tyre_variance(&self.prior);
             bend += weight * hypothesis.scale().bend_variance_inflation(&self.prior);
+            regimes += weight * hypothesis.scale().regime_variance();
         }
         mean /= weights;
         let variance = square / weights - mean * mean;
@@ -664,7 +692,7 @@ impl Identification {
         let theta = (-mean).exp();
         let absolute = MODEL_THETA_STD_DEVS[usize::from(self.has_torque)] / theta;
         let of_model = MODEL_LN_THETA_STD_DEV.powi(2) + absolute.powi(2);
-        let of_model = of_model + bend / weights;
+        let of_model = of_model + (bend + regimes) / weights;
         is_known.then(|| Identified {
             theta,
             own_ratio: (variance - of_prior).max(0.0).sqrt(),

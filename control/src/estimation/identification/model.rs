@@ -12,8 +12,10 @@
 //! with `D = (1 + n a x + xⁿ)^(1/n)` and `x = K|s|/μ_p`: its slope is K = 1/θ at zero slip, and its
 //! friction coefficient approaches `μ_p` at large slip. a = 0 with a large n is the straight rise
 //! of Yi et al. (2007), eq. (7), up to the peak; a = 1/3 with n = 3 is within 4 % of a brush model;
-//! a = 0 with n = 2.7 of a Magic Formula; a = 2/3 with n = 2 of a `LuGre` tyre. N follows from the
-//! position of the centre of mass, the slope, and measured accelerations.
+//! a = 0 with n = 2.7 of a Magic Formula; a = 2/3 with n = 2 of a `LuGre` tyre. The lateral
+//! part of s is multiplied by the ratio of the tyre's lateral to its longitudinal stiffness, so that a
+//! contact is softer to the side up to the same peak (similarity of combined slip: Pacejka, ch. 4). N
+//! follows from the position of the centre of mass, the slope, and measured accelerations.
 //!
 //! Two resistances are proportional to N. Rolling resistance is a torque that is lost in the tyre:
 //! it has to be driven, and does not act on the body. Motion resistance is a force of the ground against the
@@ -21,7 +23,7 @@
 //! contacts have to slip for it even where the robot drives straight at a constant speed.
 
 use super::dual::Real;
-use super::parameters::Robot;
+use super::physical::Robot;
 use crate::geometry::Twist;
 use crate::robot::GRAVITY_M_S2;
 
@@ -230,7 +232,10 @@ impl<T: Real> Robot<T> {
             let [x_m, y_m] = contact.place_m;
             let rim_m_s = speeds_m_s[contact.side];
             let centre_m_s = forward_m_s - turn * y_m;
-            let slips_m_s = [rim_m_s - centre_m_s, -(left_m_s + turn * x_m)];
+            let slips_m_s = [
+                rim_m_s - centre_m_s,
+                -(left_m_s + turn * x_m) * self.lateral_stiffness_ratio,
+            ];
             let theoretical_m_s = rim_m_s.abs();
             let mut reference_m_s =
                 theoretical_m_s + self.practical_slip * (centre_m_s.abs() - theoretical_m_s);

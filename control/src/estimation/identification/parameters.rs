@@ -3,15 +3,14 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::curve_prior::CurvePrior;
-use super::dual::{Dual, Real};
+use super::dual::Dual;
 use crate::estimation::{EstimatorPrior, SensorNoise};
-use crate::robot::RobotModel;
 
 /// Number of parameters.
-pub(super) const PARAMETERS: usize = 28;
+pub(super) const PARAMETERS: usize = 29;
 /// Number of parameters of the equations of motion and of the sensors' scales and offsets: all but
 /// the delays, which are the last ones.
-pub(super) const MODELLED: usize = 26;
+pub(super) const MODELLED: usize = 27;
 /// Values of all parameters.
 pub(super) type Values = SVector<f64, PARAMETERS>;
 /// Covariance or information of all parameters.
@@ -73,10 +72,12 @@ pub(super) mod index {
     /// Motion resistance coefficient: force of the ground against the wheels' motion, over their
     /// load.
     pub(in super::super) const MOTION_RESISTANCE: usize = 25;
+    /// ln of the lateral stiffness of the tyres over the longitudinal one.
+    pub(in super::super) const LATERAL_STIFFNESS: usize = 26;
     /// Delay of the gyro relative to the wheel speeds, and of the accelerometer relative to the
     /// gyro, seconds.
-    pub(in super::super) const GYRO_DELAY: usize = 26;
-    pub(in super::super) const ACCELEROMETER_DELAY: usize = 27;
+    pub(in super::super) const GYRO_DELAY: usize = 27;
+    pub(in super::super) const ACCELEROMETER_DELAY: usize = 28;
 }
 
 /// Normal prior of the parameters at the start of a ground, in the units of [`index`].
@@ -95,6 +96,10 @@ pub(super) struct Prior {
     pub(super) first_mean: Values,
     /// Standard deviation of the bend that intervals assume.
     pub(super) interval_bend_std_dev: f64,
+    /// Maximum distance of each parameter from its first mean.
+    pub(super) ranges: Values,
+    /// Variance by which the gyro's offset changes in a second, (rad/s)²/s.
+    pub(super) gyro_walk: f64,
 }
 
 impl Prior {
@@ -123,7 +128,7 @@ impl Prior {
     /// Limits parameters to their ranges.
     pub(super) fn in_range(&self, mut values: Values) -> Values {
         for place in 0..PARAMETERS {
-            let most = PRIOR_RANGE * self.std_devs[place];
+            let most = self.ranges[place];
             let mean = self.first_mean[place];
             values[place] = values[place].clamp(mean - most, mean + most);
         }
@@ -185,17 +190,18 @@ const LIMITS: [(usize, f64, f64); 4] = [
 /// Parameters of the tyres that start from the initial prior on each ground: the friction curve,
 /// the speed that slip is relative to, and the decrease of the relaxation length. All robots with
 /// the same tyres share the errors of their priors.
-pub(super) const OF_TYRES: [usize; 5] = [
+pub(super) const OF_TYRES: [usize; 6] = [
     index::PEAK,
     index::SHAPE,
     index::BEND,
     index::PRACTICAL_SLIP,
     index::RELAXATION_DECREASE,
+    index::LATERAL_STIFFNESS,
 ];
 
 /// Parameters of the ground and of its contacts with the tyres. They start from the initial
 /// prior on new ground.
-pub(super) const OF_GROUND: [usize; 10] = [
+pub(super) const OF_GROUND: [usize; 11] = [
     index::STIFFNESS,
     index::RESISTANCE,
     index::MOTION_RESISTANCE,
@@ -204,13 +210,14 @@ pub(super) const OF_GROUND: [usize; 10] = [
     index::BEND,
     index::PRACTICAL_SLIP,
     index::RELAXATION_DECREASE,
+    index::LATERAL_STIFFNESS,
     index::SLOPE_X,
     index::SLOPE_Y,
 ];
 
 /// Parameters of the load and the ground. Both are reset with a new load, because the friction
 /// curve of the tyres after a stop that is long enough for loading may differ.
-pub(super) const OF_LOAD_AND_GROUND: [usize; 15] = [
+pub(super) const OF_LOAD_AND_GROUND: [usize; 16] = [
     index::MASS,
     index::INERTIA,
     index::CENTRE_FORWARD,
@@ -224,6 +231,7 @@ pub(super) const OF_LOAD_AND_GROUND: [usize; 15] = [
     index::BEND,
     index::PRACTICAL_SLIP,
     index::RELAXATION_DECREASE,
+    index::LATERAL_STIFFNESS,
     index::SLOPE_X,
     index::SLOPE_Y,
 ];
@@ -261,10 +269,18 @@ const SPEED_OFFSET_STD_DEV: f64 = 0.005;
 /// reception delay all of them.
 const GYRO_DELAY_STD_DEV_S: f64 = 0.015;
 const ACCELEROMETER_DELAY_STD_DEV_S: f64 = 0.010;
-/// Range in which parameters stay, in standard deviations of their initial prior.
-const PRIOR_RANGE: f64 = 5.0;
+/// Range in which parameters stay, in standard deviations of their initial prior and of their random walk
+/// together.
+pub(super) const PRIOR_RANGE: f64 = 5.0;
 /// Minimum standard deviation, used where the configuration gives 0.
 pub(super) const STD_DEV_MIN: f64 = 1.0e-4;
+
+/// Returns the gradient of ln K with respect to the parameters.
+pub(super) fn ln_stiffness_gradient() -> Values {
+    let mut stiffness = Values::zeros();
+    stiffness[index::STIFFNESS] = 1.0;
+    stiffness
+}
 
 /// Returns the initial prior, before any measurement.
 pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
@@ -318,6 +334,10 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
         (index::BEND, curve.bend),
         (index::PRACTICAL_SLIP, PRACTICAL_SLIP),
         (index::RELAXATION_DECREASE, RELAXATION_DECREASE),
+        (
+            index::LATERAL_STIFFNESS,
+            (0.0, tyres.lateral_stiffness_std_dev),
+        ),
         (index::GYRO_OFFSET, (0.0, noise.gyro_offset_rad_s)),
         (
             index::FORWARD_OFFSET,
@@ -338,110 +358,17 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
         information_vector: Values::zeros(),
         std_devs: Values::zeros(),
         first_mean: Values::zeros(),
+        ranges: Values::zeros(),
         interval_bend_std_dev: curve.interval_bend_std_dev,
+        gyro_walk: noise.gyro_offset_walk.powi(2),
     };
     for (place, (mean, std_dev)) in table {
         initial.first_mean[place] = mean;
         initial.std_devs[place] = std_dev.max(STD_DEV_MIN);
+        initial.ranges[place] = PRIOR_RANGE * initial.std_devs[place];
     }
     initial.reset();
     initial
-}
-
-/// The parameters of a robot in SI units.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Robot<T> {
-    pub(super) track_m: f64,
-    pub(super) wheelbase_m: f64,
-    /// Rolling radius as it is configured, metres.
-    pub(super) nominal_radius_m: f64,
-    pub(super) stiffness: T,
-    pub(super) mass_kg: T,
-    pub(super) inertia_kg_m2: T,
-    /// Centre of mass from the wheels' centre: forward, left, up, metres.
-    pub(super) centre_m: [T; 3],
-    /// Relaxation length at zero slip, metres.
-    pub(super) relaxation_m: T,
-    /// Decrease of the relaxation length with slip.
-    pub(super) relaxation_decrease: T,
-    pub(super) slope: [T; 2],
-    /// Ratio of measured to true torque, left and right.
-    pub(super) torque_scale: [T; 2],
-    /// Inertia of one side's rotors and wheels over the square of the wheel radius, kilograms.
-    pub(super) rotors_kg: T,
-    pub(super) gear_loss: T,
-    /// Coefficients of rolling resistance and of motion resistance.
-    pub(super) resistance: T,
-    pub(super) motion_resistance: T,
-    /// Rolling radius, left and right, metres.
-    pub(super) radius_m: [T; 2],
-    pub(super) peak: T,
-    /// `K/μ_p`, the reciprocal of the slip at which a straight curve would reach `μ_p`.
-    pub(super) per_peak_slip: T,
-    /// n of the curve.
-    pub(super) sharpness: T,
-    pub(super) bend: T,
-    /// 0 for theoretical, 1 for practical slip.
-    pub(super) practical_slip: T,
-    pub(super) gyro_offset_rad_s: T,
-    pub(super) acceleration_offset_m_s2: [T; 2],
-    pub(super) speed_offset_m_s: T,
-}
-
-impl<T: Real> Robot<T> {
-    /// Converts parameters in the units of [`index`] for a robot of this configured model.
-    pub(super) fn new(values: &[T; MODELLED], model: &RobotModel) -> Self {
-        let of = |place: usize| values[place];
-        let mass_kg = of(index::MASS).exp() * model.mass_kg();
-        let (track_m, wheelbase_m) = (model.track_width_m(), model.wheelbase_m());
-        let nominal_radius_m = model.wheel_radius_m();
-        let side = |sign: f64| of(index::TORQUE_SCALE) + of(index::TORQUE_DIFFERENCE) * sign + 1.0;
-        let radius = |half: f64| {
-            (of(index::RADIUS) + of(index::RADIUS_DIFFERENCE) * half + 1.0) * nominal_radius_m
-        };
-        let shape = of(index::SHAPE);
-        let sharpness = if shape.value() > SHAPE_MIN {
-            shape.recip()
-        } else {
-            T::constant(SHAPE_MIN.recip())
-        };
-        let bend = of(index::BEND);
-        let (stiffness, peak) = (of(index::STIFFNESS).exp(), of(index::PEAK).exp());
-        Self {
-            track_m,
-            wheelbase_m,
-            nominal_radius_m,
-            stiffness,
-            mass_kg,
-            inertia_kg_m2: (of(index::MASS) + of(index::INERTIA)).exp() * model.yaw_inertia_kg_m2(),
-            centre_m: [
-                of(index::CENTRE_FORWARD) * wheelbase_m,
-                of(index::CENTRE_LEFT) * track_m,
-                of(index::HEIGHT) * track_m,
-            ],
-            relaxation_m: of(index::RELAXATION).exp(),
-            relaxation_decrease: of(index::RELAXATION_DECREASE),
-            slope: [of(index::SLOPE_X), of(index::SLOPE_Y)],
-            torque_scale: [side(-1.0), side(1.0)],
-            rotors_kg: of(index::ROTORS) * (0.5 * model.mass_kg()),
-            gear_loss: of(index::GEAR_LOSS),
-            resistance: of(index::RESISTANCE),
-            motion_resistance: of(index::MOTION_RESISTANCE),
-            radius_m: [radius(-0.5), radius(0.5)],
-            peak,
-            per_peak_slip: stiffness / peak,
-            sharpness,
-            bend: if bend.value() < 0.0 {
-                T::constant(0.0)
-            } else {
-                bend
-            },
-            practical_slip: of(index::PRACTICAL_SLIP),
-            gyro_offset_rad_s: of(index::GYRO_OFFSET),
-            acceleration_offset_m_s2: [of(index::FORWARD_OFFSET), of(index::LEFT_OFFSET)],
-            speed_offset_m_s: of(index::SPEED_OFFSET),
-        }
-    }
 }
 
 #[cfg(test)]

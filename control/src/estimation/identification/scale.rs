@@ -10,7 +10,9 @@
 
 use super::blocks::{Blocks, add_outer_square, multiply};
 use super::model::CHANNELS;
-use super::parameters::{Prior, Square, Values, index};
+use super::parameters::{Prior, Square, Values, index, ln_stiffness_gradient};
+use super::random_walk::RandomWalk;
+use super::regimes::{Regime, Regimes};
 
 /// Fraction of its information that a block loses with each later block, because sensor offsets
 /// drift.
@@ -73,6 +75,15 @@ pub(super) struct ChannelResidual {
     pub(super) square_min: f64,
 }
 
+/// End of a block.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct BlockEnd {
+    /// Regime of motion in the block.
+    pub(super) regime: Regime,
+    /// Random walk of the gyro's offset since the block before.
+    pub(super) gyro_walk: RandomWalk,
+}
+
 /// Sums of one channel over the open mean.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Mean {
@@ -109,6 +120,8 @@ pub(super) struct TimeScale {
     squares_of_block: (f64, f64),
     /// All complete blocks of this ground.
     pub(super) ground: Blocks,
+    /// The same by regime of motion.
+    regimes: Regimes,
     /// `Σ g gᵀ` of these blocks' scores g, each at the parameters that were the solution with its
     /// block.
     pub(super) scores: Square,
@@ -139,6 +152,7 @@ impl TimeScale {
             score: Values::zeros(),
             squares_of_block: (0.0, 0.0),
             ground: Blocks::none(),
+            regimes: Regimes::new(),
             scores: Square::zeros(),
             last_score: Values::zeros(),
             segment: Blocks::none(),
@@ -241,7 +255,7 @@ impl TimeScale {
 
     /// Ends the open block, which was linearised about `values`, and adds it to the ground. Once the
     /// estimate `has_converged`, a block with large residuals gets less weight.
-    pub(super) fn close_block(&mut self, values: &Values, has_converged: bool) {
+    pub(super) fn close_block(&mut self, values: &Values, end: &BlockEnd, has_converged: bool) {
         if self.compared > 0 {
             self.end_mean();
         }
@@ -253,14 +267,18 @@ impl TimeScale {
         let keeps = 1.0 - BLOCK_DECAY;
         self.segment
             .combine(&self.last, |own, last| (own + last) * keeps);
+        self.segment.add_walk(&end.gyro_walk);
         let last = &mut self.last;
         std::mem::swap(&mut last.information, &mut self.information);
         last.information_vector = self.score;
         last.information_vector
             .gemv(1.0, &last.information, values, 1.0);
         last.count = 1.0;
-        self.ground
-            .combine(&self.last, |own, last| own * keeps + last);
+        self.ground.multiply(keeps);
+        self.ground.add_walk(&end.gyro_walk);
+        self.ground.add(&self.last);
+        self.regimes.multiply(keeps);
+        self.regimes.add(&self.last, end.regime);
         self.drop_block();
     }
 
@@ -330,6 +348,7 @@ impl TimeScale {
     /// Multiplies the weights of all complete blocks.
     pub(super) fn scale_weights(&mut self, ratio: f64) {
         self.ground.multiply(ratio);
+        self.regimes.multiply(ratio);
         self.segment.multiply(ratio);
         self.last.multiply(ratio);
         multiply(self.scores.as_mut_slice(), ratio);
@@ -345,6 +364,17 @@ impl TimeScale {
         let assumed = prior.std_devs[index::BEND].powi(2);
         let added = (prior.interval_bend_std_dev.powi(2) - assumed).max(0.0);
         (self.stiffness_covariance[index::BEND] / assumed).powi(2) * added
+    }
+
+    /// Takes the next step of the comparison of the regimes of motion, about as long as a solution of the
+    /// normal equations.
+    pub(super) fn compare_regimes(&mut self, prior: &Prior) {
+        self.regimes.compare_next(prior);
+    }
+
+    /// Returns the variance of ln K by the disagreement of regimes of motion beyond noise.
+    pub(super) fn regime_variance(&self) -> f64 {
+        self.regimes.variance()
     }
 
     /// Returns the part of ln K's variance that the prior of the tyres contributes.
@@ -381,6 +411,7 @@ impl TimeScale {
     /// Drops the last block, which may contain samples of two grounds.
     pub(super) fn drop_last_block(&mut self) {
         self.ground.subtract(&self.last);
+        self.regimes.subtract_last(&self.last);
         self.last = Blocks::none();
         self.scores
             .ger(-1.0, &self.last_score, &self.last_score, 1.0);
@@ -395,13 +426,6 @@ impl TimeScale {
         self.last_score.fill(0.0);
         segment
     }
-}
-
-/// Returns the gradient of ln K with respect to the parameters.
-pub(super) fn ln_stiffness_gradient() -> Values {
-    let mut stiffness = Values::zeros();
-    stiffness[index::STIFFNESS] = 1.0;
-    stiffness
 }
 
 #[cfg(test)]
@@ -426,7 +450,11 @@ mod tests {
             scale.add(0, &compared);
             scale.end_comparison();
         }
-        scale.close_block(&prior.mean, false);
+        let end = BlockEnd {
+            regime: Regime::Straight,
+            gyro_walk: RandomWalk::of_gyro(prior, 1.0),
+        };
+        scale.close_block(&prior.mean, &end, false);
         scale.solve_with_block(&prior.mean, prior);
     }
 

@@ -6,7 +6,7 @@
 
 use super::blocks::Blocks;
 use super::parameters::{Prior, Values};
-use super::scale::{ChannelResidual, TimeScale};
+use super::scale::{BlockEnd, ChannelResidual, TimeScale};
 
 /// Numbers of comparisons in the means of the time scales: 0.05, 0.2 and 0.5 s.
 const LENGTHS: [u32; 3] = [1, 4, 10];
@@ -118,11 +118,12 @@ impl TimeScales {
         &mut self,
         values: &Values,
         prior: &Prior,
+        end: &BlockEnd,
         has_converged: bool,
     ) -> Option<Values> {
         self.solve_deferred(prior);
         for scale in &mut self.scales {
-            scale.close_block(values, has_converged);
+            scale.close_block(values, end, has_converged);
         }
         let [first, second, _] = &mut self.scales;
         let [of_first, of_second] =
@@ -139,6 +140,16 @@ impl TimeScales {
         let [.., third] = &mut self.scales;
         let of_third = third.solve_with_block(values, prior);
         self.choose(&[of_first, of_second, of_third])
+    }
+
+    /// Does a part of the work that the end of the last block left: first the solution of deferred
+    /// equations, then the comparison of the regimes of motion, step by step.
+    pub(super) fn continue_deferred(&mut self, prior: &Prior) {
+        if self.deferred.is_some() {
+            self.solve_deferred(prior);
+        } else {
+            self.scales[self.used].compare_regimes(prior);
+        }
     }
 
     /// Solves the equations that were deferred at the end of the last block.
@@ -183,6 +194,8 @@ mod tests {
 
     use super::super::model::CHANNELS;
     use super::super::parameters::{self, index};
+    use super::super::random_walk::RandomWalk;
+    use super::super::regimes::Regime;
     use super::super::scale::Residual;
     use super::*;
     use crate::estimation::{EstimatorPrior, SensorNoise};
@@ -222,9 +235,13 @@ mod tests {
                         scales.end_comparison();
                     }
                 }
-                let solution = at_once.end_block(&values, &prior, false);
+                let end = BlockEnd {
+                    regime: Regime::TurnEntry,
+                    gyro_walk: RandomWalk::of_gyro(&prior, 1.0),
+                };
+                let solution = at_once.end_block(&values, &prior, &end, false);
                 at_once.solve_deferred(&prior);
-                prop_assert_eq!(late.end_block(&values, &prior, false), solution);
+                prop_assert_eq!(late.end_block(&values, &prior, &end, false), solution);
                 was_deferred |= late.deferred.is_some();
                 // The body speed of the next block comes before the solution.
                 for scales in [&mut at_once, &mut late] {

@@ -19,6 +19,7 @@ impl Identification {
         self.delays.drop_block();
         self.block_s = 0.0;
         self.is_moving = false;
+        self.block_motion = super::BlockMotion::default();
     }
 
     /// Ends a segment and returns θ from its own blocks; None if its standard deviation is too

@@ -3,7 +3,8 @@
 use super::COMPARED_S;
 use super::dual::Real;
 use super::model::{CHANNELS, Input, Output, State};
-use super::parameters::{MODELLED, Number, Robot, Values, index};
+use super::parameters::{MODELLED, Number, Values, index};
+use super::physical::Robot;
 
 /// Number of channels that can be late: turn rate, acceleration forward and left.
 pub(super) const DELAYED: usize = 3;

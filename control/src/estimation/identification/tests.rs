@@ -1,7 +1,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::parameters::Robot;
+use super::physical::Robot;
 use super::*;
 use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 
@@ -328,7 +328,7 @@ fn the_variance_of_an_estimate_that_moved_far_is_that_of_the_blocks_that_are_lef
                     let prior = &identification.prior;
                     let (reported, _) = hypothesis.variances(prior);
                     let [left] = hypothesis
-                        .variances_of(prior, &[scale::ln_stiffness_gradient()])
+                        .variances_of(prior, &[parameters::ln_stiffness_gradient()])
                         .expect("the prior is proper");
                     let ratio = (reported / left).sqrt();
                     assert!(

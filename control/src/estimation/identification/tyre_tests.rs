@@ -1,13 +1,23 @@
 //! Friction curves that differ from what the prior assumes.
 
-use super::parameters::{Number, Robot, Values};
+use super::parameters::{Number, Values};
+use super::physical::Robot;
+use super::regimes::Regime;
 use super::tests::{SAMPLE_S, Simulated, identification};
 use super::*;
 use crate::estimation::TyrePrior;
 
 /// Drives for a minute, without torque sensors.
 fn drive_without_torque(identification: &mut Identification, robot: &mut Simulated) {
-    for _ in 0..6_000 {
+    drive_without_torque_for(identification, robot, 6_000);
+}
+
+fn drive_without_torque_for(
+    identification: &mut Identification,
+    robot: &mut Simulated,
+    samples: u32,
+) {
+    for _ in 0..samples {
         let sample = SensorSample {
             wheel_torques: None,
             ..robot.sample()
@@ -409,4 +419,67 @@ fn motion_resistance_takes_slip_and_torque_and_rolling_resistance_torque_alone()
         assert!((found - slip).abs() < 1.0e-4, "{place}: slip {found}");
         assert!((torque - 0.05).abs() < 1.0e-4, "{place}: torque {torque}");
     }
+}
+
+#[test]
+fn tyres_that_are_softer_or_stiffer_to_the_side_are_identified() {
+    for ratio in [0.6_f64, 1.3] {
+        let (error, std_dev, found) = identified_without_torque(
+            index::LATERAL_STIFFNESS,
+            |values| values[index::LATERAL_STIFFNESS] = ratio.ln(),
+            |_| {},
+        );
+        assert!((found - ratio.ln()).abs() < 0.05, "{}", found.exp());
+        assert!(
+            error.abs() < 1.96 * std_dev && error.abs() < 0.08,
+            "{ratio}: {error}, {std_dev}"
+        );
+        // Taken for isotropic, they look like other ground.
+        let (isotropic, _, _) = identified_without_torque(
+            index::LATERAL_STIFFNESS,
+            |values| values[index::LATERAL_STIFFNESS] = ratio.ln(),
+            |prior| prior.std_devs[index::LATERAL_STIFFNESS] = 1.0e-4,
+        );
+        assert!(isotropic.abs() > 3.0 * error.abs(), "{ratio}: {isotropic}");
+    }
+}
+
+/// Part of the standard deviation of ln θ that tyres share, after a minute in which K is by this ratio larger
+/// whenever the robot enters a turn, as if forces in transients were others than in steady motion.
+fn shared_with_entries_of(stiffness_ratio: f64) -> f64 {
+    let of = |stiffness: f64| {
+        Simulated::new(|values| {
+            values[index::STIFFNESS] = stiffness.ln();
+            // So far below the peak that the curve does not matter.
+            values[index::PEAK] = 0.0;
+        })
+    };
+    let (mut robot, mut ahead) = (of(2.0), of(2.0));
+    let [usual, entering] = [of(2.0).robot, of(2.0 * stiffness_ratio).robot];
+    let mut identification = identification();
+    for _ in 0..60 {
+        let mut motion = BlockMotion::default();
+        for _ in 0..100 {
+            let radius_m = identification.model.wheel_radius_m();
+            let rates_rad_s = wheel_speeds_rad_s(&ahead.sample());
+            motion.add(rates_rad_s.map(|rate| rate * radius_m));
+        }
+        robot.robot = if motion.regime() == Regime::TurnEntry {
+            entering
+        } else {
+            usual
+        };
+        drive_without_torque_for(&mut identification, &mut robot, 100);
+    }
+    let found = identification.identified().expect("θ is excited");
+    found.tyres_ratio
+}
+
+#[test]
+fn turn_entries_that_contradict_all_else_widen_the_interval() {
+    let [consistent, contradicting] = [1.0, 1.3].map(shared_with_entries_of);
+    assert!(
+        contradicting > 1.2 * consistent,
+        "{contradicting} {consistent}"
+    );
 }

@@ -20,7 +20,7 @@ const TYRE_RELAXATION_M: f64 = 0.03;
 pub(crate) type Change = fn(&mut Deviations, &mut SensorSpec);
 
 /// Single differences, each with its name in the report.
-pub(crate) const CHANGES: [(&str, Change); 32] = [
+pub(crate) const CHANGES: [(&str, Change); 34] = [
     ("nothing", |_, _| {}),
     ("payload 20 %", |robot, _| {
         robot.payload_ratio = 0.2;
@@ -51,6 +51,12 @@ pub(crate) const CHANGES: [(&str, Change); 32] = [
     }),
     ("relaxation 5 cm", |robot, _| {
         robot.relaxation_m = 0.05;
+    }),
+    ("lateral stiffness -25 %", |robot, _| {
+        robot.lateral_stiffness_ratio = 0.75;
+    }),
+    ("lateral stiffness +25 %", |robot, _| {
+        robot.lateral_stiffness_ratio = 1.25;
     }),
     ("torque scale +3 %", |robot, _| {
         robot.torque_scale = [1.03; 2];
