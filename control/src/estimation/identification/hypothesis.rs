@@ -27,6 +27,7 @@ use super::fast_changes::FastChanges;
 use super::model::{CHANNELS, Input, State};
 use super::parameters::{Number, Prior, Values, index, ln_stiffness_gradient};
 use super::physical::Robot;
+use super::regimes::ScaleRegimes;
 use super::scale::{BlockEnd, ChannelResidual, Residual, TimeScale};
 use super::scales::TimeScales;
 use super::simulation::{ChannelOutput, Predicted, Simulation, delays_s};
@@ -106,7 +107,7 @@ pub(super) struct Hypothesis {
     model: Simulation<Number>,
     /// The same with noise added to the wheel speeds; None if they have none.
     perturbed: Option<Simulation<Number>>,
-    scales: TimeScales,
+    pub(super) scales: TimeScales,
     /// Fast changes of the accelerations: measured, in the output, and by the added noise.
     fast: FastChanges,
     cost: f64,
@@ -120,7 +121,12 @@ pub(super) struct Hypothesis {
 
 impl Hypothesis {
     /// Creates an estimator at the prior's mean with another ln K; the robot moves as in `state`.
-    pub(super) fn new(prior: &Prior, ln_stiffness: f64, state: State<f64>) -> Self {
+    pub(super) fn new(
+        prior: &Prior,
+        ln_stiffness: f64,
+        state: State<f64>,
+        regimes: ScaleRegimes,
+    ) -> Self {
         let mut values = prior.mean;
         values[index::STIFFNESS] = ln_stiffness;
         Self {
@@ -128,7 +134,7 @@ impl Hypothesis {
             robot: None,
             model: Simulation::new(state.constants()),
             perturbed: None,
-            scales: TimeScales::new(),
+            scales: TimeScales::new(regimes),
             fast: FastChanges::new(),
             cost: 0.0,
             last_weight_factor: 1.0,
@@ -149,8 +155,7 @@ impl Hypothesis {
         self.model.motion()
     }
 
-    /// Returns the factor, at least 1, by which a channel's residuals exceed their standard
-    /// deviation.
+    /// Returns the factor, at least 1, by which a channel's residuals exceed their standard deviation.
     pub(super) fn residual_ratio(&self, channel: usize) -> f64 {
         self.scales.residual_ratio(channel)
     }

@@ -51,7 +51,7 @@ use hypothesis::{Hypothesis, Measured};
 use model::{CHANNELS, Input, State, gravity_m_s2};
 use parameters::{Prior, index};
 use random_walk::RandomWalk;
-use regimes::BlockMotion;
+use regimes::{BlockMotion, Regimes, ScaleRegimes};
 use scale::BlockEnd;
 use simulation::delays_s;
 use wheel_noise::WheelNoise;
@@ -132,6 +132,8 @@ pub(super) struct Identification {
     model: RobotModel,
     prior: Prior,
     hypotheses: Vec<Hypothesis>,
+    /// Comparisons of regimes that no hypothesis uses.
+    spare_regimes: Vec<ScaleRegimes>,
     /// Heading since the start, by the gyro without its offset.
     heading_rad: f64,
     gyro_offset_rad_s: f64,
@@ -191,6 +193,7 @@ impl Identification {
             model,
             prior: parameters::prior(prior, noise),
             hypotheses: Vec::with_capacity(STARTS.len()),
+            spare_regimes: STARTS.map(|_| Regimes::of_scales()).into(),
             heading_rad: 0.0,
             gyro_offset_rad_s: 0.0,
             acceleration_m_s2: [0.0; 2],
@@ -220,13 +223,17 @@ impl Identification {
     /// Replaces all hypotheses by new ones from the prior and the starting values of ln K, in the
     /// motion `state`.
     fn begin(&mut self, state: &State<f64>) {
-        self.hypotheses.clear();
+        while !self.hypotheses.is_empty() {
+            self.discard(0);
+        }
         self.change = ChangeMonitor::default();
         self.fit = Fit::new();
         self.delays.restart();
         for start in STARTS {
+            let regimes = self.spare_regimes.pop();
+            let regimes = regimes.unwrap_or_else(Regimes::of_scales);
             self.hypotheses
-                .push(Hypothesis::new(&self.prior, start, *state));
+                .push(Hypothesis::new(&self.prior, start, *state, regimes));
         }
     }
 
@@ -553,9 +560,11 @@ impl Identification {
             gyro_walk: RandomWalk::of_gyro(&self.prior, drifted_s),
         };
         end.gyro_walk.add_to_prior(&mut self.prior);
-        let prior = &self.prior;
-        self.hypotheses
-            .retain_mut(|hypothesis| hypothesis.end_block(prior, &end));
+        for index in (0..self.hypotheses.len()).rev() {
+            if !self.hypotheses[index].end_block(&self.prior, &end) {
+                self.discard(index);
+            }
+        }
         if self.hypotheses.is_empty() {
             let state = self.state();
             self.begin(&state);
@@ -612,8 +621,13 @@ impl Identification {
     /// Discards hypotheses that fit worse than the best one, and all but one of those that agree.
     fn discard_hypotheses(&mut self) {
         let most = self.least_cost() + COST_MARGIN * self.residual_square();
-        self.hypotheses
-            .retain(|hypothesis| hypothesis.age() < BLOCKS_MIN || hypothesis.cost() < most);
+        for index in (0..self.hypotheses.len()).rev() {
+            let hypothesis = &self.hypotheses[index];
+            let fits = hypothesis.cost() < most;
+            if hypothesis.age() >= BLOCKS_MIN && !fits {
+                self.discard(index);
+            }
+        }
         let mut index = 1;
         while index < self.hypotheses.len() {
             let is_same = |first: &Hypothesis, second: &Hypothesis| {
@@ -630,11 +644,17 @@ impl Identification {
                     } else {
                         other
                     };
-                    self.hypotheses.remove(worse);
+                    self.discard(worse);
                 }
                 None => index += 1,
             }
         }
+    }
+
+    /// Removes a hypothesis.
+    fn discard(&mut self, index: usize) {
+        let discarded = self.hypotheses.remove(index);
+        self.spare_regimes.push(discarded.scales.into_regimes());
     }
 
     /// Returns the lowest cost of all hypotheses.

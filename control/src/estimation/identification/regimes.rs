@@ -11,6 +11,8 @@
 use super::blocks::Blocks;
 use super::parameters::{Prior, Square, Values, index, ln_stiffness_gradient};
 
+/// Number of time scales.
+pub(super) const SCALES: usize = 3;
 /// Number of regimes.
 const REGIMES: usize = 5;
 /// Change of the mean rim speed in a block, relative to its maximum, from which the robot speeds up or
@@ -138,7 +140,29 @@ pub(super) struct Regimes {
     variance: f64,
 }
 
+/// Comparisons at all time scales. They are large, so that they are boxed, and are used again by later
+/// hypotheses, because the control loop allocates nothing.
+pub(super) type ScaleRegimes = [Box<Regimes>; SCALES];
+
 impl Regimes {
+    /// Creates comparisons for all time scales, without blocks.
+    pub(super) fn of_scales() -> ScaleRegimes {
+        std::array::from_fn(|_| Box::new(Self::new()))
+    }
+
+    /// Removes all blocks.
+    pub(super) fn clear(&mut self) {
+        for blocks in &mut self.blocks {
+            blocks.information.fill(0.0);
+            blocks.information_vector.fill(0.0);
+            blocks.count = 0.0;
+        }
+        self.factor = 1.0;
+        self.last = Regime::Straight;
+        self.comparison = Comparison::START;
+        self.variance = 0.0;
+    }
+
     /// Creates the comparison without blocks.
     pub(super) fn new() -> Self {
         Self {
@@ -350,6 +374,20 @@ mod tests {
             regimes.subtract_last(&dropped);
             let after = compare(&mut regimes);
             prop_assert!((after - before).abs() <= 1.0e-6 * before.max(1.0e-3), "{} {}", before, after);
+        }
+
+        #[test]
+        fn a_comparison_that_is_cleared_is_a_new_one(
+            values in prop::collection::vec((-1.0..1.0, 1.0..1.0e3, 0..REGIMES, 1.0e-4..1.0), 1..20),
+        ) {
+            let mut regimes = Regimes::new();
+            for (value, information, place, ratio) in values {
+                regimes.multiply(ratio);
+                regimes.add(&block(value, information), ALL[place]);
+            }
+            compare(&mut regimes);
+            regimes.clear();
+            prop_assert_eq!(regimes, Regimes::new());
         }
 
         #[test]

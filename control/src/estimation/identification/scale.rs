@@ -121,7 +121,7 @@ pub(super) struct TimeScale {
     /// All complete blocks of this ground.
     pub(super) ground: Blocks,
     /// The same by regime of motion.
-    regimes: Regimes,
+    regimes: Box<Regimes>,
     /// `Σ g gᵀ` of these blocks' scores g, each at the parameters that were the solution with its
     /// block.
     pub(super) scores: Square,
@@ -143,7 +143,8 @@ pub(super) struct TimeScale {
 
 impl TimeScale {
     /// Creates the equations without measurements, for means over `length` comparisons.
-    pub(super) fn new(length: u32) -> Self {
+    pub(super) fn new(length: u32, mut regimes: Box<Regimes>) -> Self {
+        regimes.clear();
         Self {
             length,
             means: [Mean::none(); CHANNELS],
@@ -152,7 +153,7 @@ impl TimeScale {
             score: Values::zeros(),
             squares_of_block: (0.0, 0.0),
             ground: Blocks::none(),
-            regimes: Regimes::new(),
+            regimes,
             scores: Square::zeros(),
             last_score: Values::zeros(),
             segment: Blocks::none(),
@@ -162,6 +163,11 @@ impl TimeScale {
             ln_stiffness: 0.0,
             variance: 0.0,
         }
+    }
+
+    /// Returns the comparison of the regimes of motion, for other equations.
+    pub(super) fn into_regimes(self) -> Box<Regimes> {
+        self.regimes
     }
 
     /// Returns the largest of the channels' mean squares of standardised residuals; about 1 if
@@ -461,7 +467,7 @@ mod tests {
     #[test]
     fn a_dropped_block_leaves_the_scores_of_all_others() {
         let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
-        let mut scale = TimeScale::new(1);
+        let mut scale = TimeScale::new(1, Box::new(Regimes::new()));
         end_block(&mut scale, &prior, 0.2);
         let first = scale.scores;
         end_block(&mut scale, &prior, -0.1);
@@ -478,7 +484,7 @@ mod tests {
     #[test]
     fn a_segment_that_is_taken_keeps_its_last_block_in_the_ground() {
         let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
-        let mut scale = TimeScale::new(1);
+        let mut scale = TimeScale::new(1, Box::new(Regimes::new()));
         end_block(&mut scale, &prior, 0.2);
         scale.take_segment();
         let before = scale.clone();

@@ -6,10 +6,11 @@
 
 use super::blocks::Blocks;
 use super::parameters::{Prior, Values};
+use super::regimes::{SCALES, ScaleRegimes};
 use super::scale::{BlockEnd, ChannelResidual, TimeScale};
 
 /// Numbers of comparisons in the means of the time scales: 0.05, 0.2 and 0.5 s.
-const LENGTHS: [u32; 3] = [1, 4, 10];
+const LENGTHS: [u32; SCALES] = [1, 4, 10];
 
 /// The normal equations at each time scale.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,13 +35,20 @@ struct Deferred {
 
 impl TimeScales {
     /// Creates the equations without measurements.
-    pub(super) fn new() -> Self {
+    pub(super) fn new([first, second, third]: ScaleRegimes) -> Self {
+        let [short, middle, long] = LENGTHS;
         Self {
-            scales: LENGTHS.map(TimeScale::new),
+            scales: [(short, first), (middle, second), (long, third)]
+                .map(|(length, regimes)| TimeScale::new(length, regimes)),
             used: 0,
             is_determined: true,
             deferred: None,
         }
+    }
+
+    /// Returns the comparisons of the regimes of motion, for other equations.
+    pub(super) fn into_regimes(self) -> ScaleRegimes {
+        self.scales.map(TimeScale::into_regimes)
     }
 
     /// Returns the normal equations at the time scale that is used.
@@ -195,7 +203,7 @@ mod tests {
     use super::super::model::CHANNELS;
     use super::super::parameters::{self, index};
     use super::super::random_walk::RandomWalk;
-    use super::super::regimes::Regime;
+    use super::super::regimes::{Regime, Regimes};
     use super::super::scale::Residual;
     use super::*;
     use crate::estimation::{EstimatorPrior, SensorNoise};
@@ -225,7 +233,7 @@ mod tests {
             ),
         ) {
             let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
-            let (mut at_once, mut late) = (TimeScales::new(), TimeScales::new());
+            let (mut at_once, mut late) = (TimeScales::new(Regimes::of_scales()), TimeScales::new(Regimes::of_scales()));
             let mut values = prior.mean;
             let mut was_deferred = false;
             for (residuals, speed, weight_factor) in blocks {
