@@ -95,9 +95,6 @@ const MODEL_TORQUE_MU: f64 = 0.025;
 /// shows some of what the equations miss.
 const MODEL_LN_THETA_STD_DEV: f64 = 0.042;
 const MODEL_THETA_STD_DEVS: [f64; 2] = [0.010, 0.008];
-/// Maximum standard deviation of the prior of the lateral stiffness where noise of the wheel speeds is
-/// subtracted: too little information is left to tell it from K.
-const NOISY_LATERAL_STD_DEV: f64 = 0.1;
 /// Maximum time of one gap in which the gyro's offset drifts, seconds.
 const DRIFTED_MAX_S: f64 = 3_600.0;
 /// Minimum duration of the block with which a segment ends, seconds; a shorter one is not used.
@@ -612,8 +609,7 @@ impl Identification {
         }
         self.wheel_noise.is_noise_added = true;
         // What was identified so far took the noise for slip.
-        let lateral = &mut self.prior.std_devs[index::LATERAL_STIFFNESS];
-        *lateral = lateral.min(NOISY_LATERAL_STD_DEV);
+        self.prior.assume_isotropic_tyres_and_constant_offset();
         self.prior.reset();
         self.delays = Delays::new();
         self.robot = None;

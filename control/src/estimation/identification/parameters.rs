@@ -117,6 +117,13 @@ impl Prior {
         self.information_vector = information * mean;
     }
 
+    /// Assumes tyres that are as stiff to the side as along the wheel, and a gyro that does not drift, where noise of
+    /// the wheel speeds leaves too little information to tell them from K; [`Self::reset`] applies it.
+    pub(super) fn assume_isotropic_tyres_and_constant_offset(&mut self) {
+        self.std_devs[index::LATERAL_STIFFNESS] = STD_DEV_MIN;
+        self.gyro_walk = 0.0;
+    }
+
     /// Returns the variance that the prior of the tyres' parameters [`OF_TYRES`] contributes to a
     /// parameter with these posterior covariances with all parameters. On each ground they start
     /// from the initial prior, in which they are independent.
