@@ -1,4 +1,4 @@
-//! One control tick allocates nothing.
+//! One control tick allocates nothing, and fits a small stack.
 
 mod common;
 
@@ -9,7 +9,7 @@ use common::{LOOP_S, SimRobot};
 use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
 use tread_control::estimation::{Estimator, EstimatorPrior, SensorNoise};
 use tread_control::follower::{Follower, FollowerConfig};
-use tread_control::geometry::{Point, Pose};
+use tread_control::geometry::{Point, Pose, Twist};
 use tread_control::plan::Plan;
 use tread_control::trajectory::{Trajectory, Waypoint, WaypointsSpec};
 
@@ -33,6 +33,30 @@ fn a_tick_of_a_robot_that_is_identified_allocates_nothing() {
     let (noise, prior) = (SensorNoise::default(), EstimatorPrior::default());
     robot.estimator = Estimator::with_prior(robot.model, noise, prior);
     drive(robot);
+}
+
+/// An eighth of the stack that Rust gives a thread, because callers need most of it.
+const STACK_BYTES: usize = 256 * 1024;
+
+#[test]
+fn an_estimator_is_created_and_updated_on_a_small_stack() {
+    let on_small_stack = || {
+        let mut robot = SimRobot::new(START, 2.0, 5, true);
+        let (noise, prior) = (SensorNoise::default(), EstimatorPrior::default());
+        robot.estimator = Estimator::with_prior(robot.model, noise, prior);
+        for _ in 0..500 {
+            robot.act(robot.model.wheel_speeds_from_twist(Twist {
+                linear_m_s: 0.6,
+                angular_rad_s: 0.5,
+            }));
+        }
+    };
+    std::thread::Builder::new()
+        .stack_size(STACK_BYTES)
+        .spawn(on_small_stack)
+        .expect("a thread")
+        .join()
+        .expect("a drive");
 }
 
 /// Drives a mission, and asserts that its ticks allocate nothing.

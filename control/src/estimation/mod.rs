@@ -131,15 +131,15 @@ pub struct Estimator {
     block: BlockBuilder,
     longitudinal: LongitudinalFilter,
     offsets: OffsetKnowledge,
-    /// Sums over the blocks of this ground's closed segments.
-    ground: Sums,
+    /// Sums over the blocks of this ground's closed segments; boxed because all sums are large.
+    ground: Box<Sums>,
     /// Information on θ that these segments state together; its variance includes the tyres' error.
     stated: StatedInformation,
     /// Sums over the open segment's blocks that are certainly of this ground.
-    segment: Sums,
+    segment: Box<Sums>,
     /// Sums over the blocks since the change detector's sums were last zero; they may be of the
     /// next ground.
-    pending: Sums,
+    pending: Box<Sums>,
     change: ChangeDetector,
     excitation: Excitation,
     apparent_mass: ApparentMass,
@@ -186,10 +186,10 @@ impl Estimator {
             block: BlockBuilder::default(),
             longitudinal: LongitudinalFilter::new(),
             offsets: OffsetKnowledge::unknown(&noise, &tyres),
-            ground: Sums::default(),
+            ground: Box::default(),
             stated: StatedInformation::default(),
-            segment: Sums::default(),
-            pending: Sums::default(),
+            segment: Box::default(),
+            pending: Box::default(),
             change: ChangeDetector::default(),
             excitation: Excitation::default(),
             apparent_mass: ApparentMass::default(),
@@ -383,8 +383,8 @@ impl Estimator {
         if changed {
             self.drop_pending();
         } else if self.change.is_quiet() {
-            self.segment = self.segment.plus(&self.pending);
-            self.pending = Sums::default();
+            *self.segment = self.segment.plus(&self.pending);
+            *self.pending = Sums::default();
         }
         (changed, !block.is_linear)
     }
@@ -392,7 +392,7 @@ impl Estimator {
     /// Drops the pending blocks, which may contain samples of both grounds.
     fn drop_pending(&mut self) {
         self.turning_before = None;
-        self.pending = Sums::default();
+        *self.pending = Sums::default();
         self.change = ChangeDetector::default();
         if let Some(identification) = &mut self.identification {
             identification.drop_last_block();
@@ -632,7 +632,7 @@ impl Estimator {
         let offsets = self
             .offsets
             .with_ground(&self.ground, &self.tyres, before.as_ref());
-        self.ground = self.ground.plus(&segment);
+        *self.ground = self.ground.plus(&segment);
         let theta = match &mut self.identification {
             Some(identification) => identification
                 .close_segment()
@@ -645,8 +645,8 @@ impl Estimator {
             theta.filter(|found| found.own_information > 0.0),
             self.accelerometer_offset_mu(),
         );
-        self.segment = Sums::default();
-        self.pending = Sums::default();
+        *self.segment = Sums::default();
+        *self.pending = Sums::default();
         self.refresh();
         statistics
     }
@@ -706,10 +706,10 @@ impl Estimator {
             .offsets
             .with_ground(&self.ground, &self.tyres, found.as_ref())
             .on_new_ground();
-        self.ground = Sums::default();
+        *self.ground = Sums::default();
         self.stated = StatedInformation::default();
-        self.segment = Sums::default();
-        self.pending = Sums::default();
+        *self.segment = Sums::default();
+        *self.pending = Sums::default();
         self.change = ChangeDetector::default();
         self.turning_before = None;
         self.block = BlockBuilder::default();

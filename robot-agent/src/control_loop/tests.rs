@@ -9,10 +9,13 @@ use tread_api::robot::RobotMode;
 use tread_api::terrain::TerrainRef;
 use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::ingest::MissionPhase;
+use tread_control::estimation::EstimatorPrior;
 use tread_control::geometry::Pose;
+use tread_control::robot::RobotModel;
 
-use super::channels::{EVENTS_MAX, EndReason, Fault, LoopCommand};
+use super::channels::{EVENTS_MAX, EndReason, Fault, LoopCommand, loop_channels};
 use super::site_view::SiteView;
+use super::tick::LoopCore;
 use crate::sim::scenario::{Scenario, ScenarioText};
 use crate::testing::Bench;
 
@@ -385,4 +388,23 @@ fn the_built_in_scenario_shows_every_terrain_in_time() {
             terrain.id
         );
     }
+}
+
+/// A quarter of the stack that Rust gives a thread, because callers need most of it.
+const STACK_BYTES: usize = 512 * 1024;
+
+#[test]
+fn the_loop_is_created_and_moved_on_a_small_stack() {
+    let create = || {
+        let (loop_ends, _ends) = loop_channels();
+        LoopCore::new(RobotModel::yi2007(), loop_ends)
+            .with_blind_within_fence(true)
+            .with_silent_after(Duration::from_millis(200))
+            .with_prior(EstimatorPrior::default())
+            .with_period(Duration::from_millis(20))
+            .is_standing()
+    };
+    let thread = std::thread::Builder::new().stack_size(STACK_BYTES);
+    let is_standing = thread.spawn(create).unwrap().join().unwrap();
+    assert!(!is_standing, "no wheel speed was measured yet");
 }

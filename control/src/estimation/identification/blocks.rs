@@ -24,6 +24,18 @@ impl Blocks {
         }
     }
 
+    /// Removes all blocks.
+    pub(super) fn clear(&mut self) {
+        let Self {
+            information,
+            information_vector,
+            count,
+        } = self;
+        information.fill(0.0);
+        information_vector.fill(0.0);
+        *count = 0.0;
+    }
+
     /// Multiplies the weights of all blocks.
     pub(super) fn multiply(&mut self, ratio: f64) {
         multiply(self.information.as_mut_slice(), ratio);

@@ -27,7 +27,6 @@ use super::fast_changes::FastChanges;
 use super::model::{CHANNELS, Input, State};
 use super::parameters::{Number, Prior, Values, index, ln_stiffness_gradient};
 use super::physical::Robot;
-use super::regimes::ScaleRegimes;
 use super::scale::{BlockEnd, ChannelResidual, Residual, TimeScale};
 use super::scales::TimeScales;
 use super::simulation::{ChannelOutput, Predicted, Simulation, delays_s};
@@ -121,12 +120,14 @@ pub(super) struct Hypothesis {
 
 impl Hypothesis {
     /// Creates an estimator at the prior's mean with another ln K; the robot moves as in `state`.
+    /// Clears the equations `scales` and uses them.
     pub(super) fn new(
         prior: &Prior,
         ln_stiffness: f64,
         state: State<f64>,
-        regimes: ScaleRegimes,
+        mut scales: TimeScales,
     ) -> Self {
+        scales.clear();
         let mut values = prior.mean;
         values[index::STIFFNESS] = ln_stiffness;
         Self {
@@ -134,7 +135,7 @@ impl Hypothesis {
             robot: None,
             model: Simulation::new(state.constants()),
             perturbed: None,
-            scales: TimeScales::new(regimes),
+            scales,
             fast: FastChanges::new(),
             cost: 0.0,
             last_weight_factor: 1.0,

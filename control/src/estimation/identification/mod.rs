@@ -29,6 +29,8 @@ mod recent;
 mod regimes;
 mod robot;
 mod scale;
+#[cfg(test)]
+mod scale_tests;
 mod scales;
 mod segment;
 mod simulation;
@@ -51,8 +53,9 @@ use hypothesis::{Hypothesis, Measured};
 use model::{CHANNELS, Input, State, gravity_m_s2};
 use parameters::{Prior, index};
 use random_walk::RandomWalk;
-use regimes::{BlockMotion, Regimes, ScaleRegimes};
+use regimes::BlockMotion;
 use scale::BlockEnd;
+use scales::TimeScales;
 use simulation::delays_s;
 use wheel_noise::WheelNoise;
 
@@ -132,8 +135,8 @@ pub(super) struct Identification {
     model: RobotModel,
     prior: Prior,
     hypotheses: Vec<Hypothesis>,
-    /// Comparisons of regimes that no hypothesis uses.
-    spare_regimes: Vec<ScaleRegimes>,
+    /// Normal equations that no hypothesis uses.
+    spare_scales: Vec<TimeScales>,
     /// Heading since the start, by the gyro without its offset.
     heading_rad: f64,
     gyro_offset_rad_s: f64,
@@ -193,7 +196,7 @@ impl Identification {
             model,
             prior: parameters::prior(prior, noise),
             hypotheses: Vec::with_capacity(STARTS.len()),
-            spare_regimes: STARTS.map(|_| Regimes::of_scales()).into(),
+            spare_scales: Vec::with_capacity(STARTS.len()),
             heading_rad: 0.0,
             gyro_offset_rad_s: 0.0,
             acceleration_m_s2: [0.0; 2],
@@ -230,10 +233,9 @@ impl Identification {
         self.fit = Fit::new();
         self.delays.restart();
         for start in STARTS {
-            let regimes = self.spare_regimes.pop();
-            let regimes = regimes.unwrap_or_else(Regimes::of_scales);
+            let scales = self.spare_scales.pop().unwrap_or_else(TimeScales::new);
             self.hypotheses
-                .push(Hypothesis::new(&self.prior, start, *state, regimes));
+                .push(Hypothesis::new(&self.prior, start, *state, scales));
         }
     }
 
@@ -655,7 +657,7 @@ impl Identification {
     /// Removes a hypothesis.
     fn discard(&mut self, index: usize) {
         let discarded = self.hypotheses.remove(index);
-        self.spare_regimes.push(discarded.scales.into_regimes());
+        self.spare_scales.push(discarded.scales);
     }
 
     /// Returns the lowest cost of all hypotheses.

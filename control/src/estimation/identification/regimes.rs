@@ -11,8 +11,6 @@
 use super::blocks::Blocks;
 use super::parameters::{Prior, Square, Values, index, ln_stiffness_gradient};
 
-/// Number of time scales.
-pub(super) const SCALES: usize = 3;
 /// Number of regimes.
 const REGIMES: usize = 5;
 /// Change of the mean rim speed in a block, relative to its maximum, from which the robot speeds up or
@@ -140,23 +138,10 @@ pub(super) struct Regimes {
     variance: f64,
 }
 
-/// Comparisons at all time scales. They are large, so that they are boxed, and are used again by later
-/// hypotheses, because the control loop allocates nothing.
-pub(super) type ScaleRegimes = [Box<Regimes>; SCALES];
-
 impl Regimes {
-    /// Creates comparisons for all time scales, without blocks.
-    pub(super) fn of_scales() -> ScaleRegimes {
-        std::array::from_fn(|_| Box::new(Self::new()))
-    }
-
     /// Removes all blocks.
     pub(super) fn clear(&mut self) {
-        for blocks in &mut self.blocks {
-            blocks.information.fill(0.0);
-            blocks.information_vector.fill(0.0);
-            blocks.count = 0.0;
-        }
+        self.blocks.iter_mut().for_each(Blocks::clear);
         self.factor = 1.0;
         self.last = Regime::Straight;
         self.comparison = Comparison::START;

@@ -16,7 +16,7 @@ use super::regimes::{Regime, Regimes};
 
 /// Fraction of its information that a block loses with each later block, because sensor offsets
 /// drift.
-const BLOCK_DECAY: f64 = 0.002;
+pub(super) const BLOCK_DECAY: f64 = 0.002;
 /// Standardised residual above which Huber's weight falls below 1.
 const HUBER: f64 = 3.0;
 /// Weight of each new squared residual in the exponentially weighted mean square of its channel.
@@ -39,7 +39,7 @@ pub(super) struct Residual {
 }
 
 impl Residual {
-    fn none() -> Self {
+    pub(super) fn none() -> Self {
         Self {
             value: 0.0,
             slopes: Values::zeros(),
@@ -121,7 +121,7 @@ pub(super) struct TimeScale {
     /// All complete blocks of this ground.
     pub(super) ground: Blocks,
     /// The same by regime of motion.
-    regimes: Box<Regimes>,
+    regimes: Regimes,
     /// `Σ g gᵀ` of these blocks' scores g, each at the parameters that were the solution with its
     /// block.
     pub(super) scores: Square,
@@ -143,8 +143,7 @@ pub(super) struct TimeScale {
 
 impl TimeScale {
     /// Creates the equations without measurements, for means over `length` comparisons.
-    pub(super) fn new(length: u32, mut regimes: Box<Regimes>) -> Self {
-        regimes.clear();
+    pub(super) fn new(length: u32) -> Self {
         Self {
             length,
             means: [Mean::none(); CHANNELS],
@@ -153,7 +152,7 @@ impl TimeScale {
             score: Values::zeros(),
             squares_of_block: (0.0, 0.0),
             ground: Blocks::none(),
-            regimes,
+            regimes: Regimes::new(),
             scores: Square::zeros(),
             last_score: Values::zeros(),
             segment: Blocks::none(),
@@ -165,9 +164,38 @@ impl TimeScale {
         }
     }
 
-    /// Returns the comparison of the regimes of motion, for other equations.
-    pub(super) fn into_regimes(self) -> Box<Regimes> {
-        self.regimes
+    /// Removes all measurements, in place because the equations are large.
+    pub(super) fn clear(&mut self) {
+        self.drop_block();
+        let Self {
+            length: _,
+            means,
+            compared: _,
+            information: _,
+            score: _,
+            squares_of_block: _,
+            ground,
+            regimes,
+            scores,
+            last_score,
+            segment,
+            last,
+            squares,
+            stiffness_covariance,
+            ln_stiffness,
+            variance,
+        } = self;
+        *means = [Mean::none(); CHANNELS];
+        for blocks in [ground, segment, last] {
+            blocks.clear();
+        }
+        regimes.clear();
+        scores.fill(0.0);
+        last_score.fill(0.0);
+        *squares = [1.0; CHANNELS];
+        stiffness_covariance.fill(0.0);
+        *ln_stiffness = 0.0;
+        *variance = 0.0;
     }
 
     /// Returns the largest of the channels' mean squares of standardised residuals; about 1 if
@@ -431,65 +459,5 @@ impl TimeScale {
         self.last = Blocks::none();
         self.last_score.fill(0.0);
         segment
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::super::parameters;
-    use super::*;
-    use crate::estimation::{EstimatorPrior, SensorNoise};
-
-    /// Ends a block with one residual in each of ten comparisons.
-    fn end_block(scale: &mut TimeScale, prior: &Prior, value: f64) {
-        for turn in 0..10 {
-            let mut slopes = Values::zeros();
-            slopes[index::STIFFNESS] = 0.3;
-            slopes[index::MASS] = 0.1 * f64::from(turn % 3);
-            let residual = Residual { value, slopes };
-            let compared = ChannelResidual {
-                residual,
-                noise: Residual::none(),
-                std_dev: 0.1,
-                square_min: 0.3,
-            };
-            scale.add(0, &compared);
-            scale.end_comparison();
-        }
-        let end = BlockEnd {
-            regime: Regime::Straight,
-            gyro_walk: RandomWalk::of_gyro(prior, 1.0),
-        };
-        scale.close_block(&prior.mean, &end, false);
-        scale.solve_with_block(&prior.mean, prior);
-    }
-
-    #[test]
-    fn a_dropped_block_leaves_the_scores_of_all_others() {
-        let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
-        let mut scale = TimeScale::new(1, Box::new(Regimes::new()));
-        end_block(&mut scale, &prior, 0.2);
-        let first = scale.scores;
-        end_block(&mut scale, &prior, -0.1);
-        let both = scale.scores;
-        assert!(both.norm() > 1.01 * first.norm());
-        // As a step of ln K and its restoration do.
-        scale.scale_weights(0.2);
-        scale.drop_last_block();
-        scale.scale_weights(5.0);
-        let kept = first * (1.0 - BLOCK_DECAY);
-        assert!((scale.scores - kept).norm() < 1.0e-9 * kept.norm());
-    }
-
-    #[test]
-    fn a_segment_that_is_taken_keeps_its_last_block_in_the_ground() {
-        let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
-        let mut scale = TimeScale::new(1, Box::new(Regimes::new()));
-        end_block(&mut scale, &prior, 0.2);
-        scale.take_segment();
-        let before = scale.clone();
-        scale.drop_last_block();
-        assert_eq!(scale.scores, before.scores);
-        assert_eq!(scale.ground, before.ground);
     }
 }

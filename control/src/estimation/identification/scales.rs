@@ -6,16 +6,16 @@
 
 use super::blocks::Blocks;
 use super::parameters::{Prior, Values};
-use super::regimes::{SCALES, ScaleRegimes};
 use super::scale::{BlockEnd, ChannelResidual, TimeScale};
 
 /// Numbers of comparisons in the means of the time scales: 0.05, 0.2 and 0.5 s.
-const LENGTHS: [u32; SCALES] = [1, 4, 10];
+const LENGTHS: [u32; 3] = [1, 4, 10];
 
-/// The normal equations at each time scale.
+/// The normal equations at each time scale. They are large and so on the heap; later hypotheses use them
+/// again, because the control loop allocates nothing.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct TimeScales {
-    scales: [TimeScale; LENGTHS.len()],
+    scales: [Box<TimeScale>; LENGTHS.len()],
     used: usize,
     /// Whether the last normal equations could be solved at any time scale; otherwise noise of the
     /// wheel speeds dominates the measurements.
@@ -35,20 +35,21 @@ struct Deferred {
 
 impl TimeScales {
     /// Creates the equations without measurements.
-    pub(super) fn new([first, second, third]: ScaleRegimes) -> Self {
-        let [short, middle, long] = LENGTHS;
+    pub(super) fn new() -> Self {
         Self {
-            scales: [(short, first), (middle, second), (long, third)]
-                .map(|(length, regimes)| TimeScale::new(length, regimes)),
+            scales: LENGTHS.map(|length| Box::new(TimeScale::new(length))),
             used: 0,
             is_determined: true,
             deferred: None,
         }
     }
 
-    /// Returns the comparisons of the regimes of motion, for other equations.
-    pub(super) fn into_regimes(self) -> ScaleRegimes {
-        self.scales.map(TimeScale::into_regimes)
+    /// Removes all measurements.
+    pub(super) fn clear(&mut self) {
+        self.scales.iter_mut().for_each(|scale| scale.clear());
+        self.used = 0;
+        self.is_determined = true;
+        self.deferred = None;
     }
 
     /// Returns the normal equations at the time scale that is used.
@@ -76,18 +77,22 @@ impl TimeScales {
 
     /// Ends a comparison, of which all channels were added.
     pub(super) fn end_comparison(&mut self) {
-        self.scales.iter_mut().for_each(TimeScale::end_comparison);
+        self.scales
+            .iter_mut()
+            .for_each(|scale| scale.end_comparison());
     }
 
     /// Drops the measurements of the open block.
     pub(super) fn drop_block(&mut self) {
-        self.scales.iter_mut().for_each(TimeScale::drop_block);
+        self.scales.iter_mut().for_each(|scale| scale.drop_block());
     }
 
     /// Drops the last block, which may contain samples of two grounds.
     pub(super) fn drop_last_block(&mut self) {
         debug_assert!(self.deferred.is_none());
-        self.scales.iter_mut().for_each(TimeScale::drop_last_block);
+        self.scales
+            .iter_mut()
+            .for_each(|scale| scale.drop_last_block());
     }
 
     /// Multiplies the weights of all complete blocks.
@@ -109,7 +114,7 @@ impl TimeScales {
     /// Takes the blocks of the open segment at the used scale; the ground keeps them.
     pub(super) fn take_segment(&mut self) -> Blocks {
         debug_assert!(self.deferred.is_none());
-        let [first, second, third] = self.scales.each_mut().map(TimeScale::take_segment);
+        let [first, second, third] = self.scales.each_mut().map(|scale| scale.take_segment());
         match self.used {
             0 => first,
             1 => second,
@@ -203,7 +208,7 @@ mod tests {
     use super::super::model::CHANNELS;
     use super::super::parameters::{self, index};
     use super::super::random_walk::RandomWalk;
-    use super::super::regimes::{Regime, Regimes};
+    use super::super::regimes::Regime;
     use super::super::scale::Residual;
     use super::*;
     use crate::estimation::{EstimatorPrior, SensorNoise};
@@ -233,7 +238,7 @@ mod tests {
             ),
         ) {
             let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
-            let (mut at_once, mut late) = (TimeScales::new(Regimes::of_scales()), TimeScales::new(Regimes::of_scales()));
+            let (mut at_once, mut late) = (TimeScales::new(), TimeScales::new());
             let mut values = prior.mean;
             let mut was_deferred = false;
             for (residuals, speed, weight_factor) in blocks {
