@@ -1,6 +1,6 @@
 //! `tracking`: every law behind the shipped localisation, on both worlds' robots.
 //!
-//! `cargo run --release -p tread-lab --bin tracking -- [--seeds N] [--seed N] [--tune]
+//! `cargo run --release -p tread-lab --bin tracking -- [--seeds N] [--seed N] [--tune LAWS]
 //! [--json | --markdown]`
 //!
 //! A line is a world, a course, a ground and a quality of positions; all laws drive it with the same
@@ -55,15 +55,26 @@ struct Arguments {
     /// First seed
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Search for every law's gains on these lines first, instead of the ones found before
-    #[arg(long)]
-    tune: bool,
+    /// Search for the gains of these laws on these lines first, instead of the ones found before
+    #[arg(long, value_enum, value_delimiter = ',')]
+    tune: Vec<Tuned>,
     /// Print one JSON object instead of a table
     #[arg(long, conflicts_with = "markdown")]
     json: bool,
     /// Print the table of the report
     #[arg(long)]
     markdown: bool,
+}
+
+/// Law whose gains are searched for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Tuned {
+    /// Kanayama's tracker with integral action
+    Kanayama,
+    /// Regulated pure pursuit
+    Pursuit,
+    /// Our law
+    Ours,
 }
 
 /// A line: what is driven where.
@@ -211,12 +222,15 @@ impl Gains for KanayamaGains {
 }
 
 impl Gains for PursuitConfig {
-    const GAINS: usize = 2;
+    const GAINS: usize = 4;
     fn scaled(mut self, gain: usize, by: f64) -> Self {
         match gain {
             0 => self.lookahead_time_s *= by,
-            _ => self.lookahead_min_m *= by,
+            1 => self.lookahead_min_m *= by,
+            2 => self.lookahead_max_m *= by,
+            _ => self.scaling_radius_m *= by,
         }
+        self.lookahead_max_m = self.lookahead_max_m.max(self.lookahead_min_m);
         self
     }
     fn law(self) -> (Law, TrackerConfig) {
@@ -407,10 +421,12 @@ fn main() -> anyhow::Result<ExitCode> {
     }
     let (mut kanayama, mut pursuit) = (KANAYAMA, PursuitConfig::default());
     let mut ours = TrackerConfig::default();
-    if arguments.tune {
-        ours = tuned(&places, &arguments, ours)?;
-        kanayama = tuned(&places, &arguments, kanayama)?;
-        pursuit = tuned(&places, &arguments, pursuit)?;
+    for law in &arguments.tune {
+        match law {
+            Tuned::Kanayama => kanayama = tuned(&places, &arguments, kanayama)?,
+            Tuned::Pursuit => pursuit = tuned(&places, &arguments, pursuit)?,
+            Tuned::Ours => ours = tuned(&places, &arguments, ours)?,
+        }
     }
     let laws = [
         ("Kanayama, integral", kanayama.law(), ThetaSource::Nothing),

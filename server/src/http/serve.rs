@@ -21,7 +21,7 @@ use tracing::{debug, warn};
 
 use super::events::Cut;
 use super::guarded::Guarded;
-use super::identity::guard::{Peer, purpose_of_path};
+use super::identity::guard::{HEAD_MAX, Peer, purpose_of_path};
 use super::tls::Tls;
 use crate::app::App;
 use crate::connections::{ACCEPT_REST, BOUNDS, Connections, Slot};
@@ -34,8 +34,6 @@ pub const FIRST_BYTE_TIMEOUT: Duration = Duration::from_secs(5);
 pub const TLS_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum time for a request's headers to arrive, and for a connection to be idle.
 pub const HEADER_TIMEOUT: Duration = Duration::from_secs(10);
-/// Maximum size of a request's head, bytes.
-const HEAD_MAX: usize = 64 * 1024;
 /// Maximum time for open requests after the stop.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
 /// Header in which proxies name their client.

@@ -38,6 +38,9 @@ const STOP_ONE: &str = "/v1/sites/{site}/robots/{robot}/stop";
 const QUERY_MAX: usize = 4_096;
 /// Maximum length of a request's path, bytes.
 const PATH_MAX: usize = 2_048;
+/// Maximum size of a request's head, bytes. The HTTP library reads up to twice as much when all of it
+/// arrives at once.
+pub(in crate::http) const HEAD_MAX: usize = 64 * 1024;
 /// Maximum length of path and request id in the audit log, characters.
 const AUDIT_TEXT_MAX: usize = 200;
 
@@ -99,6 +102,14 @@ impl Guard {
             let detail = format!("a path may have at most {PATH_MAX} bytes, a query {QUERY_MAX}");
             let problem = Problem::new(ProblemType::RequestTooLong).detail(detail);
             return Err(Refusal::counted(&counters.refused_too_long, problem));
+        }
+        let headers = request.headers().iter();
+        let headers_length = headers.map(|(name, value)| name.as_str().len() + value.len());
+        if headers_length.sum::<usize>() > HEAD_MAX {
+            counters.refused_too_long.one();
+            // Without a body, as the HTTP library answers to a longer one.
+            let refusal = StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE.into_response();
+            return Err(Refusal::of(refusal));
         }
         let host = provenance(request.headers()).host;
         if !host.is_some_and(|host| self.names.knows(host)) {

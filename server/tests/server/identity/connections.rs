@@ -101,14 +101,17 @@ async fn what_is_too_long_or_too_deep_is_refused() {
     assert!(status.is_client_error(), "{said}");
     let (status, _) = yard.get_value("/v1/sites?limit=1001").await;
     assert_eq!(status, StatusCode::BAD_REQUEST);
-    let head = yard
-        .client()
-        .get(yard.url("/v1/sites"))
-        .header("x-long", "y".repeat(100_000));
-    assert_eq!(
-        yard.send(head).await.0,
-        StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE
-    );
+    // What arrives at once is read whole, up to twice the limit.
+    for length in [66_000, 100_000] {
+        let head = yard
+            .client()
+            .get(yard.url("/v1/sites"))
+            .header("x-long", "y".repeat(length));
+        assert_eq!(
+            yard.send(head).await.0,
+            StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE
+        );
+    }
     yard.server.stop().await.unwrap();
 }
 
