@@ -16,12 +16,12 @@ const IDENTIFIED_MAX_S: f64 = 0.03;
 /// Difference of the newest delay from the identified one above which the sensor is late, in seconds and in
 /// standard deviations.
 const UNIDENTIFIED: Difference = Difference {
-    least_s: 0.015,
+    least_s: 0.02,
     least_std_devs: 3.0,
 };
 /// The same of the difference from earlier blocks.
 const CHANGED: Difference = Difference {
-    least_s: 0.009,
+    least_s: 0.012,
     least_std_devs: 2.0,
 };
 /// Number of newest blocks that are taken together.
@@ -254,7 +254,7 @@ impl Delays {
             let earlier = self.earlier[sensor].delay();
             is_late |= newest.differs(identified, UNIDENTIFIED)
                 || earlier.is_some_and(|earlier| newest.differs(earlier, CHANGED));
-            if newest.variance_s2.sqrt() < UNIDENTIFIED.least_s {
+            if newest.variance_s2.sqrt() < IDENTIFIED_MAX_S {
                 newest_s[sensor] = newest.delay_s;
             }
         }

@@ -45,7 +45,7 @@ fn delays_of_gyro_and_accelerometer_are_identified_and_do_not_bias_theta() {
         let stiffness = 2.0_f64;
         let mut robot = Simulated::new(|values| {
             values[index::STIFFNESS] = stiffness.ln();
-            values[index::RELAXATION] = 0.03_f64.ln();
+            values[index::RELAXATION] = 0.03_f64.sqrt();
         });
         let late = Late {
             gyro,

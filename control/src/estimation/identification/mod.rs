@@ -96,7 +96,7 @@ const MODEL_TORQUE_MU: f64 = 0.025;
 /// the model's equations: a relative one, of ln θ, and an absolute one, of θ, which is a slip per
 /// friction coefficient and dominates where θ is small: without and with measured torque, which
 /// shows some of what the equations miss.
-const MODEL_LN_THETA_STD_DEV: f64 = 0.042;
+const MODEL_LN_THETA_STD_DEV: f64 = 0.037;
 const MODEL_THETA_STD_DEVS: [f64; 2] = [0.010, 0.008];
 /// Maximum time of one gap in which the gyro's offset drifts, seconds.
 const DRIFTED_MAX_S: f64 = 3_600.0;
@@ -606,7 +606,10 @@ impl Identification {
     fn restart_with_wheel_noise(&mut self) {
         let is_noisy = self.best().is_some_and(Hypothesis::is_noisy);
         let is_measured = self.wheel_noise.significant_density().is_some();
-        if !is_noisy || !is_measured || self.wheel_noise.is_noise_added {
+        // A model that late sensors or a change of the ground contradict may change faster than what is
+        // measured, without any noise.
+        let is_wrong = self.late_sensor().is_some() || self.newest_misfit_ratio().is_some();
+        if !is_noisy || !is_measured || is_wrong || self.wheel_noise.is_noise_added {
             return;
         }
         self.wheel_noise.is_noise_added = true;

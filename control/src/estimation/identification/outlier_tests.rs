@@ -52,7 +52,7 @@ fn what_the_first_blocks_miss_is_no_scatter_of_measurements() {
             (index::STIFFNESS, 5.5_f64.ln()),
             (index::INERTIA, 0.2),
             (index::HEIGHT, 0.6),
-            (index::RELAXATION, 0.011_f64.ln()),
+            (index::RELAXATION, 0.011_f64.sqrt()),
             (index::CENTRE_FORWARD, 0.06),
             (index::MOTION_RESISTANCE, 0.03),
             (index::SHAPE, 0.05),

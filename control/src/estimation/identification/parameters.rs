@@ -30,7 +30,7 @@ pub(super) mod index {
     pub(in super::super) const CENTRE_FORWARD: usize = 3;
     /// Centre of mass to the left of it, over the track.
     pub(in super::super) const CENTRE_LEFT: usize = 4;
-    /// ln of the relaxation length in metres.
+    /// Square root of the relaxation length in metres.
     pub(in super::super) const RELAXATION: usize = 5;
     /// Slopes of the ground (rise per distance) along the axes of the frame in which identification
     /// began.
@@ -187,7 +187,8 @@ impl Prior {
 }
 
 /// Parameters with limits besides the range of their prior: minimum and maximum.
-const LIMITS: [(usize, f64, f64); 4] = [
+const LIMITS: [(usize, f64, f64); 5] = [
+    (index::RELAXATION, RELAXATION_ROOT_MIN, f64::INFINITY),
     (index::SHAPE, SHAPE_MIN, f64::INFINITY),
     (index::BEND, 0.0, f64::INFINITY),
     (index::PRACTICAL_SLIP, 0.0, 1.0),
@@ -249,6 +250,8 @@ const LN_STIFFNESS: (f64, f64) = (1.1, 2.0);
 const SHAPE: (f64, f64) = (0.3, 0.2);
 /// Mean and standard deviation of the part of practical slip.
 const PRACTICAL_SLIP: (f64, f64) = (0.25, 0.35);
+/// Minimum of the relaxation length's square root: with 1 mm the contacts' forces follow slip at once.
+const RELAXATION_ROOT_MIN: f64 = 0.0316;
 /// Mean, standard deviation and maximum of the relaxation length's decrease.
 const RELAXATION_DECREASE: (f64, f64) = (0.3, 0.35);
 const RELAXATION_DECREASE_MAX: f64 = 1.5;
@@ -294,8 +297,9 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
     let tyres = &prior.tyres;
     let curve = CurvePrior::of(tyres);
     let payload = 1.0 + prior.model.payload_ratio;
-    // Variance of the logarithm of a log-normal distribution with that mean and standard deviation.
-    let spread = (1.0 + (tyres.relaxation_std_dev_m / tyres.relaxation_m).powi(2)).ln();
+    // To first order; so that the mean of the squares is the configured one.
+    let root_std_dev = 0.5 * tyres.relaxation_std_dev_m / tyres.relaxation_m.sqrt();
+    let root_mean = (tyres.relaxation_m - root_std_dev.powi(2)).max(0.0).sqrt();
     let side = noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2;
     let table = [
         (index::STIFFNESS, LN_STIFFNESS),
@@ -310,10 +314,7 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
             index::CENTRE_LEFT,
             (0.0, 0.5 * tyres.load_difference_std_dev),
         ),
-        (
-            index::RELAXATION,
-            (tyres.relaxation_m.ln() - 0.5 * spread, spread.sqrt()),
-        ),
+        (index::RELAXATION, (root_mean, root_std_dev)),
         (index::SLOPE_X, (0.0, SLOPE_STD_DEV)),
         (index::SLOPE_Y, (0.0, SLOPE_STD_DEV)),
         (

@@ -77,7 +77,7 @@ impl<T: Real> Robot<T> {
                 of(index::CENTRE_LEFT) * track_m,
                 of(index::HEIGHT) * track_m,
             ],
-            relaxation_m: of(index::RELAXATION).exp(),
+            relaxation_m: of(index::RELAXATION) * of(index::RELAXATION),
             relaxation_decrease: of(index::RELAXATION_DECREASE),
             slope: [of(index::SLOPE_X), of(index::SLOPE_Y)],
             torque_scale: [side(-1.0), side(1.0)],

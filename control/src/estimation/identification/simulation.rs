@@ -24,27 +24,50 @@ pub(super) struct Simulation<T> {
     mean: Output<T>,
     /// Outputs of the last sample.
     newest: Option<Output<T>>,
-    /// Outputs of the last sample before the last comparison.
-    compared: Option<Delayed<T>>,
+    /// Outputs of the sample before, and the time from then to the last one, seconds.
+    previous: Option<(Delayed<T>, f64)>,
+    /// End of the last comparison.
+    compared: Option<End<T>>,
 }
 
 /// Outputs of the channels that can be late: turn rate, acceleration forward and left.
 type Delayed<T> = [T; DELAYED];
+
+/// Outputs at the end of a comparison, half a sample after the mean of its last one, and their rates of
+/// change there, per second.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct End<T> {
+    outputs: Delayed<T>,
+    rates: Delayed<T>,
+}
+
+fn delayed<T: Copy>(output: &Output<T>) -> Delayed<T> {
+    let [forward, left] = output.acceleration_m_s2;
+    [output.turn_rad_s, forward, left]
+}
 
 /// Outputs since the last comparison.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Outputs<T> {
     /// Means, in the order of the channels without the body speed.
     pub(super) means: [T; CHANNELS - 1],
-    /// Rates of change of the first channels, which can be late, per second.
+    /// Mean first and second derivatives in time of the first channels, which can be late, per second and
+    /// per second squared.
     pub(super) rates: Delayed<T>,
+    pub(super) second_rates: Delayed<T>,
 }
 
 impl<T: Real> Outputs<T> {
-    /// Returns a channel's mean as a sensor with a delay of `delay_s` would measure it, to first
-    /// order.
+    /// Returns a channel's mean as a sensor with a delay of `delay_s` would measure it, to second
+    /// order: slip delays the motion by `θ v/g`, and only the second order tells one from the other.
     fn late(&self, channel: usize, delay_s: f64) -> T {
         self.means[channel] - self.rates[channel] * delay_s
+            + self.second_rates[channel] * (0.5 * delay_s * delay_s)
+    }
+
+    /// Returns the derivative of [`Self::late`] by the delay, per second.
+    fn late_by_delay(&self, channel: usize, delay_s: f64) -> T {
+        self.second_rates[channel] * delay_s - self.rates[channel]
     }
 }
 
@@ -65,7 +88,7 @@ impl Outputs<Number> {
         let mut predicted = self.means.map(|mean| Predicted::of(&mean));
         for (channel, delay_s) in delays_s.into_iter().enumerate() {
             predicted[channel] = Predicted::of(&self.late(channel, delay_s));
-            let by_delay = -self.rates[channel].value;
+            let by_delay = self.late_by_delay(channel, delay_s).value;
             predicted[channel].slopes[index::GYRO_DELAY] = by_delay;
             if channel > 0 {
                 predicted[channel].slopes[index::ACCELEROMETER_DELAY] = by_delay;
@@ -101,12 +124,17 @@ impl<T: Real> Simulation<T> {
             state,
             mean: Output::zero(),
             newest: None,
+            previous: None,
             compared: None,
         }
     }
 
     /// Advances the robot by one sample and adds its outputs with the weight `share`.
     pub(super) fn advance(&mut self, robot: &Robot<T>, input: &Input, share: f64) {
+        self.previous = self
+            .newest
+            .as_ref()
+            .map(|output| (delayed(output), input.time_s));
         let output = self.newest.insert(robot.advance(&mut self.state, input));
         let add = |mean: &mut T, value: T| *mean = *mean + value * share;
         add(&mut self.mean.turn_rad_s, output.turn_rad_s);
@@ -128,16 +156,25 @@ impl<T: Real> Simulation<T> {
     /// Returns the outputs since the last call, `compared_s` seconds ago, and begins anew. They
     /// were weighted by [`COMPARED_S`].
     pub(super) fn take_outputs(&mut self, compared_s: f64) -> Outputs<T> {
-        let newest = self.newest.as_ref().map(|output| {
-            let [forward, left] = output.acceleration_m_s2;
-            [output.turn_rad_s, forward, left]
-        });
-        let before = std::mem::replace(&mut self.compared, newest);
-        let rates = match (newest, before) {
-            (Some(newest), Some(before)) => {
-                std::array::from_fn(|place| (newest[place] - before[place]) * compared_s.recip())
+        let rate = |now: &Delayed<T>, before: &Delayed<T>, time_s: f64| {
+            std::array::from_fn(|place| (now[place] - before[place]) * time_s.recip())
+        };
+        let end = self.newest.as_ref().zip(self.previous.as_ref());
+        let end = end.map(|(newest, (previous, time_s))| {
+            let mean = delayed(newest);
+            let rates: Delayed<T> = rate(&mean, previous, *time_s);
+            End {
+                outputs: std::array::from_fn(|place| mean[place] + rates[place] * (0.5 * time_s)),
+                rates,
             }
-            _ => [T::constant(0.0); DELAYED],
+        });
+        let before = std::mem::replace(&mut self.compared, end);
+        let (rates, second_rates) = match (&self.compared, &before) {
+            (Some(end), Some(before)) => (
+                rate(&end.outputs, &before.outputs, compared_s),
+                rate(&end.rates, &before.rates, compared_s),
+            ),
+            _ => ([T::constant(0.0); DELAYED], [T::constant(0.0); DELAYED]),
         };
         let mean = std::mem::replace(&mut self.mean, Output::zero());
         let [forward, left] = mean.acceleration_m_s2;
@@ -146,6 +183,7 @@ impl<T: Real> Simulation<T> {
         Outputs {
             means: means.map(|mean| mean * (COMPARED_S / compared_s)),
             rates,
+            second_rates,
         }
     }
 }
@@ -191,5 +229,79 @@ impl ChannelOutput {
     /// Returns its slope with respect to one parameter.
     pub(super) fn slope(&self, place: usize) -> f64 {
         self.output.slopes[place]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::identification::parameters;
+    use crate::estimation::{EstimatorPrior, SensorNoise};
+    use crate::geometry::Twist;
+    use crate::robot::RobotModel;
+
+    const SAMPLE_S: f64 = 0.005;
+    const SAMPLES_PER_COMPARISON: usize = 10;
+
+    /// Wheel speeds that change as fast as those of a robot that is tracked.
+    fn wheels_rad_s(time_s: f64) -> [f64; 2] {
+        let half = (2.0 * time_s).sin() + 0.5 * (15.0 * time_s).sin();
+        [6.0 - half, 6.0 + half + 0.3 * (20.0 * time_s).sin()]
+    }
+
+    #[test]
+    fn late_sensors_measure_the_outputs_of_before() {
+        let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
+        let values = std::array::from_fn(|place| prior.mean[place]);
+        let robot = Robot::<f64>::new(&values, &RobotModel::yi2007());
+        let twist = Twist {
+            linear_m_s: 0.4,
+            angular_rad_s: 0.0,
+        };
+        let mut simulation = Simulation::new(State::rolling(twist));
+        let mut all: Vec<Delayed<f64>> = Vec::new();
+        let mut squares = [[0.0; 2]; 2];
+        for comparison in 0..200 {
+            for _ in 0..SAMPLES_PER_COMPARISON {
+                let wheels = wheels_rad_s(f64::from(u32::try_from(all.len()).unwrap()) * SAMPLE_S);
+                let input = Input {
+                    wheels_rad_s: wheels,
+                    wheels_rad_s2: [0.0; 2],
+                    heading_rad: 0.0,
+                    acceleration_m_s2: [0.0; 2],
+                    is_specific_force: false,
+                    time_s: SAMPLE_S,
+                };
+                simulation.advance(&robot, &input, SAMPLE_S / COMPARED_S);
+                all.push(delayed(simulation.newest.as_ref().unwrap()));
+            }
+            let outputs = simulation.take_outputs(COMPARED_S);
+            if comparison < 20 {
+                continue;
+            }
+            let first_order = Outputs {
+                second_rates: [0.0; DELAYED],
+                ..outputs
+            };
+            // 15 ms late.
+            let window = all.len() - SAMPLES_PER_COMPARISON - 3..all.len() - 3;
+            let late: Delayed<f64> = std::array::from_fn(|channel| {
+                all[window.clone()]
+                    .iter()
+                    .map(|one| one[channel])
+                    .sum::<f64>()
+                    / 10.0
+            });
+            for (order, outputs) in [first_order, outputs].iter().enumerate() {
+                let measured = outputs.measured([0.015; DELAYED]);
+                squares[order][0] += (measured[0] - late[0]).powi(2);
+                squares[order][1] += (measured[1] - late[1]).powi(2);
+            }
+        }
+        let [first, second] = squares;
+        for channel in 0..2 {
+            let ratio = (second[channel] / first[channel]).sqrt();
+            assert!(ratio < 0.3, "channel {channel}: {ratio}");
+        }
     }
 }

@@ -113,7 +113,7 @@ fn a_robot_with_payload_on_bent_tyres_is_identified_on_any_ground() {
             values[index::STIFFNESS] = stiffness.ln();
             values[index::MASS] = 1.25_f64.ln();
             values[index::PEAK] = 0.4_f64.ln();
-            values[index::RELAXATION] = 0.05_f64.ln();
+            values[index::RELAXATION] = 0.05_f64.sqrt();
             values[index::SLOPE_X] = 0.05;
         });
         let mut identification = identification();

@@ -245,7 +245,7 @@ fn a_robot_that_is_held_while_its_wheels_turn_has_finite_forces() {
     let mut values = prior.mean;
     for (place, value) in [
         (index::STIFFNESS, 20.0_f64.ln()),
-        (index::RELAXATION, 0.005_f64.ln()),
+        (index::RELAXATION, 0.005_f64.sqrt()),
         (index::PRACTICAL_SLIP, 1.0),
         (index::RELAXATION_DECREASE, 1.0),
     ] {
@@ -350,7 +350,7 @@ fn slip_follows_faster_where_the_relaxation_length_decreases_with_it() {
         speed_uphill(
             |values| {
                 values[index::PRACTICAL_SLIP] = 0.0;
-                values[index::RELAXATION] = 0.2_f64.ln();
+                values[index::RELAXATION] = 0.2_f64.sqrt();
                 values[index::RELAXATION_DECREASE] = decrease;
             },
             20,
