@@ -614,7 +614,7 @@ impl Identification {
         }
         self.wheel_noise.is_noise_added = true;
         // What was identified so far took the noise for slip.
-        self.prior.assume_isotropic_tyres_and_constant_offset();
+        self.prior.assume_usual_tyres_and_constant_offset();
         self.prior.reset();
         self.delays = Delays::new();
         self.robot = None;

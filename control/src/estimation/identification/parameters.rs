@@ -117,10 +117,13 @@ impl Prior {
         self.information_vector = information * mean;
     }
 
-    /// Assumes tyres that are as stiff to the side as along the wheel, and a gyro that does not drift, where noise of
-    /// the wheel speeds leaves too little information to tell them from K; [`Self::reset`] applies it.
-    pub(super) fn assume_isotropic_tyres_and_constant_offset(&mut self) {
+    /// Assumes tyres that are as stiff to the side as along the wheel and do not relax at once, and a gyro
+    /// that does not drift, where noise of the wheel speeds leaves too little information to tell them from
+    /// K; [`Self::reset`] applies it.
+    pub(super) fn assume_usual_tyres_and_constant_offset(&mut self) {
         self.std_devs[index::LATERAL_STIFFNESS] = STD_DEV_MIN;
+        let relaxation = &mut self.std_devs[index::RELAXATION];
+        *relaxation = relaxation.min(RELAXATION_ROOT_STD_DEV_WITH_NOISE);
         self.gyro_walk = 0.0;
     }
 
@@ -252,6 +255,9 @@ const SHAPE: (f64, f64) = (0.3, 0.2);
 const PRACTICAL_SLIP: (f64, f64) = (0.25, 0.35);
 /// Minimum of the relaxation length's square root: with 1 mm the contacts' forces follow slip at once.
 const RELAXATION_ROOT_MIN: f64 = 0.0316;
+/// Maximum standard deviation of it where noise of the wheel speeds is subtracted: contacts that relax at
+/// once would pass that noise to the accelerations.
+const RELAXATION_ROOT_STD_DEV_WITH_NOISE: f64 = 0.06;
 /// Mean, standard deviation and maximum of the relaxation length's decrease.
 const RELAXATION_DECREASE: (f64, f64) = (0.3, 0.35);
 const RELAXATION_DECREASE_MAX: f64 = 1.5;
