@@ -11,7 +11,7 @@ use super::simulation::{DELAYED, delays_s};
 use crate::estimation::{LateSensor, SensorDelays};
 
 /// Magnitude of the identified delays, of the gyro relative to the wheel speeds and of the accelerometer
-/// relative to the gyro, above which they are not accurate, seconds: outputs follow delays to first order.
+/// relative to the gyro, above which they are not accurate, seconds: outputs follow delays to second order.
 const IDENTIFIED_MAX_S: f64 = 0.03;
 /// Difference of the newest delay from the identified one above which the sensor is late, in seconds and in
 /// standard deviations.
