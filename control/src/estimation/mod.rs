@@ -38,6 +38,7 @@ mod curved;
 mod demonstrated_friction;
 mod excitation;
 mod expectation;
+mod frozen_speed;
 mod frozen_torque;
 mod ground_offsets;
 mod identification;
@@ -60,6 +61,7 @@ use block::{Block, BlockBuilder, BlockContext, ThetaBound};
 use change::ChangeDetector;
 use excitation::Excitation;
 pub use expectation::{ExpectedAccuracy, expected_accuracy};
+use frozen_speed::FrozenSpeed;
 use frozen_torque::FrozenTorque;
 use identification::{Identification, Identified};
 use longitudinal::{LongitudinalFilter, SlipBound};
@@ -155,6 +157,7 @@ pub struct Estimator {
     turning_before: Option<Row>,
     last_wheels: Option<WheelSpeeds>,
     frozen_torque: FrozenTorque,
+    frozen_speed: FrozenSpeed,
     /// Manoeuvres of the last minutes on this ground.
     manoeuvres: Manoeuvres,
     /// Time of the samples dropped since the last used one, seconds.
@@ -207,6 +210,7 @@ impl Estimator {
             turning_before: None,
             last_wheels: None,
             frozen_torque: FrozenTorque::default(),
+            frozen_speed: FrozenSpeed::default(),
             manoeuvres: Manoeuvres::default(),
             skipped_s: 0.0,
             jumps_in_a_row: 0,
@@ -259,6 +263,7 @@ impl Estimator {
         };
         self.manoeuvres.add(motion, dt_s);
         let sample = &self.frozen_torque.without(sample, &self.model, dt_s);
+        let sample = &self.frozen_speed.without(sample, dt_s);
         let level = match &self.identification {
             Some(identification) if sample.is_specific_force => {
                 identification.without_gravity(sample)
