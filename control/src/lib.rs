@@ -32,6 +32,7 @@ pub mod plant;
 pub mod profile;
 pub mod progress;
 pub mod reference;
+mod repeats;
 pub mod robot;
 mod sliding;
 pub mod slip;

@@ -6,10 +6,10 @@
 use nalgebra::{Matrix2x4, Matrix4, Rotation2, Vector2, Vector4};
 
 use super::history::{BIN_S, Means};
-use super::repeats::Repeats;
 use super::{Comparison, Finding, Kind, Subject, Unit};
 use crate::geometry::wrap_angle_rad;
 use crate::measured::BodyAcceleration;
+use crate::repeats::Repeats;
 
 /// Number of bins over which the speed is differentiated.
 const BINS: usize = 4;

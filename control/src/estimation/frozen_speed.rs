@@ -4,35 +4,32 @@
 //! stays the same to the last bit is no measurement of a robot that moves, and θ would be wrong by what
 //! it hides. A speed in coarse steps may repeat for a moment; it is used again as soon as it changes.
 
+use std::time::Duration;
+
 use super::SensorSample;
+use crate::repeats::Repeats;
 
-/// Time of equal speeds from which they are frozen, seconds.
-const FROZEN_AFTER_S: f64 = 1.0;
-/// Minimum number of equal speeds in that time: a slow receiver repeats none.
-const REPEATS_MIN: u32 = 3;
+/// Time and number of equal speeds from which they are frozen: a slow receiver repeats none.
+const FROZEN_AFTER: Duration = Duration::from_secs(1);
+const FROZEN_COUNT: u32 = 4;
 
-/// Time for which the speed over ground has been the same.
+/// Equal speeds over ground.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct FrozenSpeed {
-    last_m_s: Option<f64>,
-    repeated_s: f64,
-    repeats: u32,
+    repeats: Repeats,
+    /// Time since the first sample.
+    at: Duration,
 }
 
 impl FrozenSpeed {
     /// Returns the sample, taken `time_s` seconds after the one before, without its speed over ground if
     /// that is frozen.
     pub(super) fn without(&mut self, sample: &SensorSample, time_s: f64) -> SensorSample {
-        self.repeated_s += time_s;
+        self.at += Duration::from_secs_f64(time_s);
         if let Some(speed_m_s) = sample.body_speed_m_s {
-            let last = self.last_m_s.replace(speed_m_s);
-            if last.is_some_and(|last| last.to_bits() == speed_m_s.to_bits()) {
-                self.repeats = self.repeats.saturating_add(1);
-            } else {
-                (self.repeats, self.repeated_s) = (0, 0.0);
-            }
+            self.repeats.take(self.at, [speed_m_s, 0.0, 0.0]);
         }
-        let is_frozen = self.repeats >= REPEATS_MIN && self.repeated_s >= FROZEN_AFTER_S;
+        let is_frozen = self.repeats.have_lasted(FROZEN_AFTER, FROZEN_COUNT);
         SensorSample {
             body_speed_m_s: sample.body_speed_m_s.filter(|_| !is_frozen),
             ..*sample

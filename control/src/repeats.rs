@@ -14,7 +14,7 @@ const REPEATING_COUNT: u32 = 3;
 
 /// Consecutive equal values of a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Repeats {
+pub(crate) struct Repeats {
     words: [u64; 3],
     since: Option<Duration>,
     count: u32,
@@ -23,7 +23,7 @@ pub(super) struct Repeats {
 
 impl Repeats {
     /// Adds the next measurement of the channel: up to three values, the others 0.
-    pub(super) fn take(&mut self, at: Duration, values: [f64; 3]) {
+    pub(crate) fn take(&mut self, at: Duration, values: [f64; 3]) {
         let words = values.map(f64::to_bits);
         if self.since.is_none() || words != self.words {
             *self = Self {
@@ -39,18 +39,23 @@ impl Repeats {
     }
 
     /// Returns whether the values have been equal for [`FROZEN_AFTER`].
-    pub(super) fn is_frozen(&self) -> bool {
-        self.count >= FROZEN_COUNT && self.duration >= FROZEN_AFTER
+    pub(crate) fn is_frozen(&self) -> bool {
+        self.have_lasted(FROZEN_AFTER, FROZEN_COUNT)
     }
 
     /// Returns whether the values have been equal for [`REPEATING_AFTER`], and may prove to be
     /// frozen.
-    pub(super) fn is_repeating(&self) -> bool {
-        self.count >= REPEATING_COUNT && self.duration >= REPEATING_AFTER
+    pub(crate) fn is_repeating(&self) -> bool {
+        self.have_lasted(REPEATING_AFTER, REPEATING_COUNT)
+    }
+
+    /// Returns whether at least `count` values have been equal, over at least `duration`.
+    pub(crate) fn have_lasted(&self, duration: Duration, count: u32) -> bool {
+        self.count >= count && self.duration >= duration
     }
 
     /// Returns the time of the first of the equal values.
-    pub(super) fn since(&self) -> Option<Duration> {
+    pub(crate) fn since(&self) -> Option<Duration> {
         self.since
     }
 }
